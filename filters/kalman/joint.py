@@ -90,8 +90,10 @@ class JointBelief:
 
     def forget_clones(self, count: int) -> None:
         """Marginalise the oldest clones: their rows and columns are dropped."""
-        first = self.clone_columns.start
-        self._cov = _of_slices(self._cov, [slice(0, first), slice(first + 6 * count, self._cov.shape[0])])
+        cov, n, first = self._cov, 6 * count, self.clone_columns.start
+        self._cov = np.empty((len(cov) - n, len(cov) - n))
+        self._cov[:first, :first], self._cov[first:, :first] = cov[:first, :first], cov[first + n :, :first]
+        self._cov[:first, first:], self._cov[first:, first:] = cov[:first, first + n :], cov[first + n :, first + n :]
         self.clones, self.first_clones = self.clones[count:], self.first_clones[count:]
 
     def forget_landmarks(self, which: BoolArray) -> None:

@@ -19,7 +19,6 @@ What is computed of each track is in :mod:`filters.kalman.kernels`, which is com
 import fcntl
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -34,11 +33,11 @@ from filters.kalman.joint import (
     root_with_information,
     times_root,
 )
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, MISMATCHED_TRACK_FACTOR, FrameGate
-from toolkit.models.state import POSE, Belief
+from toolkit.models.state import Belief
 from toolkit.progress import Progress
 
 
@@ -182,7 +181,7 @@ def _tested(
     """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, if any."""
     from filters.kalman import kernels
 
-    count, width = sightings.seen.shape
+    width = sightings.seen.shape[1]
     points, reliable, nis, dof, worst, weights, (normals, halves, of_halves, blocks, vector) = kernels.eliminate_tracks(
         (sightings.uvs_px, sightings.seen),
         (window.poses, window.poses_at),
@@ -198,8 +197,8 @@ def _tested(
         sightings.track_ids[accepted],
         sightings.seen[accepted],
         points[accepted],
-        normals[accepted],
-        halves.reshape(count, 3, 6 * width)[accepted],
+        normals,
+        halves.reshape(len(normals), 3, 6 * width),
         blocks,
         vector - halves.T @ of_halves,
     )
@@ -276,5 +275,4 @@ def _corrected(joint: JointBelief, root: Array, matrix_root: Array, vector: Arra
     halves = divided_by_root(matrix_root, np.concatenate([to_core, vector[:, None]], axis=1))
     half = halves[:, :-1]
     delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
-    moved = core.displaced(delta, se3_exp(delta[POSE]))
-    return replace(moved, cov=0.5 * (cov + cov.T))
+    return core.moved(delta, cov)
