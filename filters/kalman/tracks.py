@@ -109,8 +109,9 @@ class WindowTracks:
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that is still seen starts again."""
-        taken = TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
-        self.seen[rows] = False
+        which = np.flatnonzero(rows)  # found once, not for each array
+        taken = TrackSightings(self.track_ids[which], self.uvs_px[which], self.seen[which])
+        self.seen[which] = False
         return taken
 
 

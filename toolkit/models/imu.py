@@ -17,6 +17,7 @@ from toolkit.models.graph_state import MotionModel
 from toolkit.models.state import IMU_LAYOUT, POSITION, ROTATION, Belief, Prediction
 
 _VELOCITY = slice(6, 9)
+_IDENTITY = np.eye(IMU_LAYOUT.size)
 
 # GTSAM requires a noise of position integration (m/s/sqrt(Hz)); this one is far below any accelerometer's effect.
 INTEGRATION_DENSITY = 1e-6
@@ -65,10 +66,10 @@ def _preintegrated(
 def predict(preintegration: Preintegration, T_world_imu: Array, v_world: Array, bias: Array) -> Prediction:
     """Predict a state (pose (4, 4), velocity (3,) m/s, bias (6,)) over the preintegrated interval."""
     state = gtsam.NavState(gtsam.Pose3(T_world_imu), v_world)
-    d_state, d_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-    predicted = preintegration.predict(state, constant_bias(bias), d_state, d_bias)
-    transition = np.eye(15)
-    transition[:9, :9], transition[:9, 9:] = d_state, d_bias
+    by_start = np.empty((9, 15), order="F")  # GTSAM writes to both parts
+    predicted = preintegration.predict(state, constant_bias(bias), by_start[:, :9], by_start[:, 9:])
+    transition = _IDENTITY.copy()
+    transition[:9] = by_start
     noise = np.asarray(preintegration.residualCovariance())
     return Prediction(predicted.pose().matrix(), predicted.velocity(), transition, noise)
 
