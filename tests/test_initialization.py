@@ -16,8 +16,7 @@ from toolkit.measurements import Prior
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
-from toolkit.simulation.scenes import Scene
-from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
+from toolkit.simulation.scenes import FreeTrajectory, RotationSpline, Scene, UniformKnots, VectorSpline
 
 SEEDS = range(3)
 

@@ -18,9 +18,8 @@ from toolkit.measurements import TwistNoise
 from toolkit.registry import discover, find
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import FLIGHT, Scenario, simulate
-from toolkit.simulation.scenes import Scene, room
+from toolkit.simulation.scenes import FreeTrajectory, RotationSpline, Scene, UniformKnots, VectorSpline, room
 from toolkit.simulation.sensors import Odometer
-from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
 from toolkit.verify import gave_up
 
 HALT_AT_S, HALT_S, MOVING_S, RATE_HZ = 4.0, 30.0, 10.0, 3.0

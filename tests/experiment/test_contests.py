@@ -5,7 +5,7 @@ import pytest
 
 from toolkit.experiment.contests import Advantage, degrees_of_freedom, less_drift, less_median, less_over_seeds
 from toolkit.geometry import Array, about_z, se3
-from toolkit.metrics.parts.against_truth import Matched
+from toolkit.metrics.parts.evaluation import Matched
 
 FRAMES = 400
 

@@ -9,7 +9,7 @@ from tests.metrics.conftest import drive_poses, make_run, make_sequence, perturb
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
-from toolkit.metrics.parts.against_truth import associate
+from toolkit.metrics.parts.evaluation import associate
 from toolkit.sequence import Truth
 
 PERIOD_NS = 100_000_000

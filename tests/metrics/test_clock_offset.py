@@ -5,7 +5,7 @@ import pytest
 
 from toolkit.geometry import Array, se3, se3_exp
 from toolkit.metrics import clock_offset
-from toolkit.metrics.parts.against_truth import Matched, PairsAgainstTruth, distance_along
+from toolkit.metrics.parts.evaluation import Matched, PairsAgainstTruth, distance_along
 from toolkit.metrics.parts.scores import Scores
 
 PERIOD_S = 0.1

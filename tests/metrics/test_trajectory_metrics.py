@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from tests.metrics.conftest import drive_poses, make_run, make_sequence, perturb
 from toolkit.geometry import about_z, se3, se3_exp, transform
 from toolkit.metrics import score_run
-from toolkit.metrics.parts.against_truth import fit_se3, fit_yaw
+from toolkit.metrics.parts.evaluation import fit_se3, fit_yaw
 from toolkit.metrics.parts.scores import Unavailable
 
 ERRORS = ["ate_none_m", "ate_se3_m", "ate_yaw_m", "ate_sim3_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg"]

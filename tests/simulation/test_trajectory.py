@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_inverse, se3_log, so3_log
-from toolkit.simulation.scenes import hall, road
-from toolkit.simulation.trajectory import SmoothTrajectory, blending_matrix
+from toolkit.simulation.scenes import SmoothTrajectory, blending_matrix, hall, road
 
 STEP_S = 1e-4
 TRAJECTORIES = {"road": road(20.0).trajectory, "hall": hall(20.0).trajectory}

@@ -24,7 +24,8 @@ from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, nees, rpe, uncertainty
-from toolkit.metrics.parts.against_truth import (
+from toolkit.metrics.parts.consistency import NOT_MET, OTHER_WORLD, BodyErrors, StatedErrors, nees_of, with_covariances
+from toolkit.metrics.parts.evaluation import (
     STAMP_TOLERANCE_NS,
     Matched,
     PairsAgainstTruth,
@@ -33,7 +34,6 @@ from toolkit.metrics.parts.against_truth import (
     median_period_ns,
     poses_at,
 )
-from toolkit.metrics.parts.consistency import NOT_MET, OTHER_WORLD, BodyErrors, StatedErrors, nees_of, with_covariances
 from toolkit.metrics.parts.readings import likelier_reading
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import content_digest

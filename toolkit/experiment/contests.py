@@ -27,7 +27,7 @@ from toolkit.experiment.units import drift_in_body
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES
 from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.against_truth import Matched
+from toolkit.metrics.parts.evaluation import Matched
 from toolkit.metrics.parts.scores import Unavailable
 
 if TYPE_CHECKING:

@@ -17,9 +17,8 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import TRUTH
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
-from toolkit.metrics.parts.against_truth import STAMP_TOLERANCE_NS, associate, median_period_ns, poses_at
 from toolkit.metrics.parts.consistency import body_errors, with_covariances
-from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.evaluation import STAMP_TOLERANCE_NS, Evaluation, associate, median_period_ns, poses_at
 from toolkit.metrics.parts.readings import likelier_reading
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.sequence import LONGEST_NAME, Sequence, Truth

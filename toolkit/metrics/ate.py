@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.metrics.clock_offset import other_point
-from toolkit.metrics.parts.against_truth import (
+from toolkit.metrics.parts.evaluation import (
     AgainstTruth,
     Alignment,
     Matched,

@@ -17,10 +17,9 @@ from functools import partial
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics.parts.against_truth import lengths, rmse
 from toolkit.metrics.parts.consistency import NO_SUCH_BLOCK, body_errors, state_errors, stated_errors
 from toolkit.metrics.parts.cramer_rao import claimed_bound, efficient
-from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.evaluation import Evaluation, lengths, rmse
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model

@@ -15,7 +15,7 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics.parts.against_truth import AgainstTruth, Matched, fit_se3, lengths, rmse
+from toolkit.metrics.parts.evaluation import AgainstTruth, Matched, fit_se3, lengths, rmse
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 45

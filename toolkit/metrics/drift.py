@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from toolkit.metrics.parts.against_truth import AgainstTruth
+from toolkit.metrics.parts.evaluation import AgainstTruth
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 40

@@ -18,8 +18,7 @@ from toolkit.answers import Run
 from toolkit.arrays import rows_of
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import Array, se3_inverse, transform
-from toolkit.metrics.parts.against_truth import rmse
-from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.evaluation import Evaluation, rmse
 from toolkit.metrics.parts.leave_one_out import CAP_PX, FEWEST_VIEWS, errors_left_out, reprojection_errors_px
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models import stereo

@@ -13,7 +13,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics.parts.against_truth import (
+from toolkit.metrics.parts.evaluation import (
     STAMP_TOLERANCE_NS,
     AgainstTruth,
     Matched,

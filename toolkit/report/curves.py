@@ -19,15 +19,6 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import numbers, of_attributes
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
 from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.against_truth import (
-    Alignment,
-    associate,
-    finite_poses,
-    fit_se3,
-    fit_yaw,
-    median_period_ns,
-    place_first,
-)
 from toolkit.metrics.parts.consistency import (
     POSE_DOF,
     body_errors,
@@ -35,6 +26,15 @@ from toolkit.metrics.parts.consistency import (
     nees_over_time,
     nis_over_time,
     starts_in_the_truths_world,
+)
+from toolkit.metrics.parts.evaluation import (
+    Alignment,
+    associate,
+    finite_poses,
+    fit_se3,
+    fit_yaw,
+    median_period_ns,
+    place_first,
 )
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION

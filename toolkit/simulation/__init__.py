@@ -1,7 +1,7 @@
 """Simulated recordings with exact truth: a smooth trajectory, landmarks to look at, and sensors with known noise.
 
-Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
-``trajectory`` (B-splines) and ``sensors`` (visibility, tracks and noise). ``faults`` plants faults in a recording.
+Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory, of B-splines, and landmarks of
+each) and ``sensors`` (visibility, tracks and noise). ``faults`` plants faults in a recording.
 ``filming`` renders images instead of tracks, with ``renderer`` (which has the visible world), and measures the
 errors of tracks made of them.
 """

@@ -32,8 +32,8 @@ from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
 from toolkit.simulation.renderer import Eye, Floats, SensorNoise, Surfaces, atlas, exposed, furnished_hall, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
+from toolkit.simulation.scenes import SmoothTrajectory
 from toolkit.simulation.sensors import Imu
-from toolkit.simulation.trajectory import SmoothTrajectory
 
 # The file that marks a folder in the layout of real recordings as simulated, and says what was simulated.
 ABOUT, SCHEMA = "simulation.json", "vislam.simulation/1"

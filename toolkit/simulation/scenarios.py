@@ -21,9 +21,8 @@ from toolkit.measurements import GRAVITY_WORLD, NS_PER_S, ImuNoise, Prior, Stere
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors
-from toolkit.simulation.scenes import Scene, SceneOf, hall, road
+from toolkit.simulation.scenes import Kinematics, Scene, SceneOf, SmoothTrajectory, hall, road
 from toolkit.simulation.sensors import CameraLimits, Imu, MotionMeasurements, Odometer, TrackNoise
-from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 
 START_NS = 1_600_000_000 * NS_PER_S
 # The measurements of an hour take a gigabyte.

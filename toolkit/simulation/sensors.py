@@ -14,7 +14,7 @@ from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistNoise
 from toolkit.models.stereo import CHANNELS, project
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.sequence import Observations
-from toolkit.simulation.trajectory import Kinematics
+from toolkit.simulation.scenes import Kinematics
 
 # Poses projected at a time: bounds the memory of the (poses, 3, landmarks) intermediate.
 _POSES_AT_ONCE = 64

@@ -11,8 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
-from toolkit.metrics.parts.against_truth import finite_poses, median_period_ns, place_first, true_poses_at
-from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.evaluation import Evaluation, finite_poses, median_period_ns, place_first, true_poses_at
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.models.state import IMU_LAYOUT, POSE, TWIST_LAYOUT, Layout

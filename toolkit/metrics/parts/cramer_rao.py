@@ -28,8 +28,8 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import Packet, Prior, StereoFrame, StereoRig, is_left_only
-from toolkit.metrics.parts.against_truth import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
+from toolkit.metrics.parts.evaluation import place_first
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import stereo
 from toolkit.models.factors import StereoFactors, landmark_keys, ordering_of

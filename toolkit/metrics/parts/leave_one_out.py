@@ -17,7 +17,6 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoRig, is_left_only
-from toolkit.metrics.parts.against_truth import finite_poses
 from toolkit.models import stereo
 from toolkit.sequence import Observations
 
@@ -168,7 +167,7 @@ def errors_left_out(observations: Observations, poses: Array, rig: StereoRig) ->
     They are in the order of tracks, each track's by frame. ``poses`` (K, 4, 4) T_world_imu are those of all frames, NaN
     where there is none.
     """
-    posed = np.flatnonzero(finite_poses(poses)[observations.frame])
+    posed = np.flatnonzero(np.isfinite(poses[observations.frame]).all(axis=(1, 2)))
     by_track = posed[np.lexsort((observations.frame[posed], observations.track_id[posed]))]
     _, track, views = np.unique(observations.track_id[by_track], return_inverse=True, return_counts=True)
     rows = by_track[views[track] >= FEWEST_VIEWS]

@@ -15,7 +15,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.metrics.bound import AgainstBound, against_bound
-from toolkit.metrics.parts.against_truth import rmse
+from toolkit.metrics.parts.evaluation import rmse
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import (
     COMPONENTS,

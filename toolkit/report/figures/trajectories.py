@@ -16,7 +16,7 @@ from toolkit.files.writing import plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
-from toolkit.metrics.parts.against_truth import Matched, angles_deg, changes, lengths, rmse
+from toolkit.metrics.parts.evaluation import Matched, angles_deg, changes, lengths, rmse
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
