@@ -1,5 +1,7 @@
 """Absolute trajectory error: how far the estimated positions are from the true ones, under four alignments."""
 
+from typing import Any
+
 import numpy as np
 
 from toolkit.geometry import Array
@@ -17,30 +19,17 @@ from toolkit.metrics.parts.evaluation import (
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 10
+
+
+def _rmse(key: str, fitted: str, heading: str, **shown: Any) -> Metric:
+    return Metric(f"ate_{key}_m", f"RMSE of position {fitted} (m)", "m", ("ATE", heading), **shown)
+
+
 METRICS = (
-    Metric(
-        "ate_none_m",
-        "RMSE of position with only the first pose placed, nothing fitted (m)",
-        "m",
-        ("ATE", "none"),
-        over_seeds=True,
-    ),
-    Metric(
-        "ate_se3_m",
-        "RMSE of position after fitting rotation and translation (m)",
-        "m",
-        ("ATE", "SE(3)"),
-        table="always",
-    ),
-    Metric(
-        "ate_yaw_m",
-        "RMSE of position after fitting heading and translation (m)",
-        "m",
-        ("ATE", "yaw"),
-        table="always",
-        over_seeds=True,
-    ),
-    Metric("ate_sim3_m", "RMSE of position after fitting rotation, translation and scale (m)", "m", ("ATE", "Sim(3)")),
+    _rmse("none", "with only the first pose placed, nothing fitted", "none", over_seeds=True),
+    _rmse("se3", "after fitting rotation and translation", "SE(3)", table="always"),
+    _rmse("yaw", "after fitting heading and translation", "yaw", table="always", over_seeds=True),
+    _rmse("sim3", "after fitting rotation, translation and scale", "Sim(3)"),
     Metric("ate_se3_deg", "RMSE of the rotation angle after the fit of ate_se3_m (deg)", "deg", ("ATE rot", "SE(3)")),
 )
 # A remark is made where the estimate's world is tilted by this angle (deg) and the tilt explains more than half of the

@@ -5,6 +5,7 @@ may be consistent in its pose and not in its biases; the error shows in the pose
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -27,32 +28,18 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.models.gating import mahalanobis_squared
 
 ORDER = 75
+
+
+def _mean(key: str, meaning: str, heading: str, **shown: Any) -> Metric:
+    return Metric(f"nees_{key}_mean", meaning, "1", ("NEES", heading), best="one", **shown)
+
+
+_ALONE = "the same of the {} alone, over its 3 degrees of freedom"
+_OF_BLOCK = "mean normalised error squared of the {} over its {} degrees of freedom; 1 is consistent"
 _OF_POSE = (
-    Metric(
-        "nees_pose_mean",
-        "mean normalised error squared of the pose over its 6 degrees of freedom; 1 is consistent",
-        "1",
-        ("NEES", "pose"),
-        best="one",
-        table="always",
-        over_seeds=True,
-    ),
-    Metric(
-        "nees_ori_mean",
-        "the same of the orientation alone, over its 3 degrees of freedom",
-        "1",
-        ("NEES", "rot"),
-        best="one",
-        over_seeds=True,
-    ),
-    Metric(
-        "nees_pos_mean",
-        "the same of the position alone, over its 3 degrees of freedom",
-        "1",
-        ("NEES", "pos"),
-        best="one",
-        over_seeds=True,
-    ),
+    _mean("pose", _OF_BLOCK.format("pose", 6), "pose", table="always", over_seeds=True),
+    _mean("ori", _ALONE.format("orientation"), "rot", over_seeds=True),
+    _mean("pos", _ALONE.format("position"), "pos", over_seeds=True),
     Metric(
         "nees_pose_in_band_percent",
         "poses whose NEES is within the two-sided 95 % chi-square band of one run (percent)",
@@ -61,19 +48,10 @@ _OF_POSE = (
         best="most",
     ),
 )
-_OF_STATE = tuple(
-    Metric(
-        f"nees_{key}_mean",
-        f"mean normalised error squared of the {block} over its 3 degrees of freedom; 1 is consistent",
-        "1",
-        ("NEES", heading),
-        best="one",
-    )
-    for key, block, heading in (
-        ("vel", "velocity", "vel"),
-        ("gyro_bias", "gyro bias", "gyro b"),
-        ("accel_bias", "accelerometer bias", "acc b"),
-    )
+_OF_STATE = (
+    _mean("vel", _OF_BLOCK.format("velocity", 3), "vel"),
+    _mean("gyro_bias", _OF_BLOCK.format("gyro bias", 3), "gyro b"),
+    _mean("accel_bias", _OF_BLOCK.format("accelerometer bias", 3), "acc b"),
 )
 METRICS = (*_OF_POSE, *_OF_STATE)
 OF_POSE = tuple(metric.key for metric in _OF_POSE)
