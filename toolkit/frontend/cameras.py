@@ -113,7 +113,9 @@ def rectified(left: Camera, right: Camera, T_right_left: Array, where: str) -> R
     baseline_m = -float(projection_right[0, 3] / projection_right[0, 0])
     K = np.array(projection_left[:, :3], dtype=np.float64)
     if "equidistant" in (left.distortion, right.distortion):
-        K = _keeping_resolution(left, right)
+        # A pinhole with the resolution that wide-angle cameras have in the middle of their view.
+        (width, height), focal_px = left.size_px, float(np.mean([left.pinhole_px[:2], right.pinhole_px[:2]]))
+        K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     maps = (_maps(left, np.asarray(R_rect_left), K), _maps(right, np.asarray(R_rect_right), K))
     fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return RectifiedPair(fx, fy, cx, cy, baseline_m, left.size_px, left.size_px, np.array(R_rect_left), maps)
@@ -140,13 +142,6 @@ def _check_pair(left: Camera, right: Camera, T_right_left: Array, where: str) ->
         raise DataError(
             f"{where}: the right camera stands {side} of the left one; exchange them, or correct the extrinsics"
         )
-
-
-def _keeping_resolution(left: Camera, right: Camera) -> Array:
-    """Return K (3, 3) of a pinhole with the resolution that wide-angle cameras have in the middle of their view."""
-    focal_px = float(np.mean([left.pinhole_px[:2], right.pinhole_px[:2]]))
-    width, height = left.size_px
-    return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
 
 
 def _maps(camera: Camera, R_rect_cam: Array, K: Array) -> Maps:

@@ -12,7 +12,6 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.frontend.cameras import Image
 from toolkit.geometry import Array, BoolArray, IntArray
 
 _HALF_PX = 7
@@ -129,8 +128,3 @@ def _normalised(values: Floats) -> tuple[Floats, Floats]:
     norms = np.maximum(np.sqrt(np.einsum("np,np->n", centred, centred)), np.float32(1e-6))
     centred /= norms[:, None]
     return centred, norms
-
-
-def as_floats(image: Image) -> Floats:
-    """Return an image as 32-bit floats, which are interpolated without rounding."""
-    return image.astype(np.float32)

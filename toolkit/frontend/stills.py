@@ -51,20 +51,14 @@ def write_video(
         for _, image in _drawn(recording, tracks, np.arange(tracks.t_ns.size), progress):
             video.write(image)
         video.release()
-        _check_complete(partial / _VIDEO, tracks.t_ns.size, directory)
+        # OpenCV does not say where it could not write.
+        reader = cv2.VideoCapture(str(partial / _VIDEO))
+        there = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+        reader.release()
+        if there != tracks.t_ns.size:
+            why = f"{there} of {tracks.t_ns.size} frames of {_VIDEO} are there; is the disk full?"
+            raise OutputError(f"{directory} cannot be written ({why}); choose another directory with --out")
     return (_VIDEO,)
-
-
-def _check_complete(video: Path, frames: int, directory: Path) -> None:
-    """Raise OutputError unless a video has all of its frames: OpenCV writes it and does not say where it could not."""
-    import cv2
-
-    reader = cv2.VideoCapture(str(video))
-    there = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    reader.release()
-    if there != frames:
-        why = f"{there} of {frames} frames of {_VIDEO} are there; is the disk full?"
-        raise OutputError(f"{directory} cannot be written ({why}); choose another directory with --out")
 
 
 def _written_by_us(directory: Path) -> frozenset[str]:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from toolkit.frontend.cameras import Image, RectifiedPair
 from toolkit.frontend.motion import Rigidity, StereoMotion
-from toolkit.frontend.patches import Floats, Patches, as_floats, inverse
+from toolkit.frontend.patches import Floats, Patches, inverse
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.settings import Frontend
 
@@ -111,7 +111,7 @@ class Tracker:
 
         Return None, and stay at the pair before, where the right image is not of the same instant as the left one.
         """
-        floats, right_floats = as_floats(left), as_floats(right)
+        floats, right_floats = (image.astype(np.float32) for image in (left, right))  # interpolated without rounding
         found, motion = self._followed(left, floats)
         paired = self._fitted_right(right_floats, self._paired(left, right, found))
         agrees = motion.agrees(paired.left_px, paired.right_px, paired.ids)

@@ -23,14 +23,14 @@ from toolkit.errors import OutputError
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.frontend.cameras import Camera, Distortion
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
-from toolkit.measurements import NS_PER_S, ImuNoise
+from toolkit.measurements import NS_PER_S
 from toolkit.models import stereo
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
-from toolkit.simulation.renderer import Eye, Floats, SensorNoise, Surfaces, atlas, exposed, furnished_hall, light
+from toolkit.simulation.renderer import Eye, Floats, Surfaces, atlas, developed, exposed, furnished_hall, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
 from toolkit.simulation.scenes import SmoothTrajectory
 from toolkit.simulation.sensors import Imu
@@ -160,9 +160,8 @@ class _Crew:
         self, trajectory: SmoothTrajectory, surfaces: Surfaces, pair: _Pair, filming: Filming, seed: int
     ) -> None:
         self._trajectory, self._surfaces, self._pair, self._seed = trajectory, surfaces, pair, seed
-        self._filming, self._sensor = filming, SensorNoise()
+        self._filming, self._eye = filming, Eye.of(pair.camera)
         atlas()  # before any thread asks for it
-        self._eye = Eye.of(pair.camera)
         self._swing_rad = 2.0 * np.pi * float(self._rng(0, 2).uniform())
 
     def png(self, k: int, t_ns: int, side: int) -> bytes:
@@ -177,7 +176,7 @@ class _Crew:
 
         gain = (1.0 + _SWING * np.sin(2.0 * np.pi * t_s / _SWING_S + self._swing_rad)) * (_RIGHT_GAIN if side else 1.0)
         seen = exposed(shot, t_s, self._filming.exposure_s, _SHOTS)
-        image = self._sensor.developed(seen, gain, self._rng(k, side))
+        image = developed(seen, gain, self._rng(k, side))
         return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
     def _rng(self, k: int, what: int) -> np.random.Generator:
@@ -193,7 +192,17 @@ def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Pat
     for camera, T_imu_cam in zip(_CAMERAS, pair.T_imu_cams, strict=True):
         (mav0 / camera / "data").mkdir(parents=True)
         (mav0 / camera / "data.csv").write_text(f"#timestamp [ns],filename\n{names}")
-        (mav0 / camera / "sensor.yaml").write_text(_camera_yaml(pair.camera, T_imu_cam, scenario.camera.rate_hz))
+        about = _sensor_yaml(
+            "camera",
+            T_imu_cam,
+            rate_hz=f"{scenario.camera.rate_hz:g}",
+            resolution=list(pair.camera.size_px),
+            camera_model="pinhole",
+            intrinsics=list(pair.camera.pinhole_px),
+            distortion_model=_EUROC_NAMES[pair.camera.distortion],
+            distortion_coefficients=pair.camera.coefficients.tolist(),
+        )
+        (mav0 / camera / "sensor.yaml").write_text(about)
     imu, sensor, truth = sequence.motion, scenario.motion, sequence.truth
     assert isinstance(imu, ImuSamples)
     assert isinstance(sensor, Imu)
@@ -206,7 +215,13 @@ def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Pat
             imu.t_ns.tolist(), _columns(w_RS_S="rad s^-1", a_RS_S="m s^-2"), np.hstack([imu.gyro_radps, imu.accel_mps2])
         )
     )
-    (mav0 / "imu0/sensor.yaml").write_text(_imu_yaml(sensor.noise, sensor.rate_hz))
+    stated = {"rate_hz": sensor.rate_hz} | {
+        f"{name}_{kind}": getattr(sensor.noise, f"{short}_{kind}")
+        for name, short in (("gyroscope", "gyro"), ("accelerometer", "accel"))
+        for kind in ("noise_density", "random_walk")
+    }
+    about = _sensor_yaml("imu", np.eye(4), **{name: f"{value:g}" for name, value in stated.items()})
+    (mav0 / "imu0/sensor.yaml").write_text(about)
     poses = truth.T_world_imu
     q_wxyz = np.roll(quaternion_from_rotation(poses[:, :3, :3]), 1, axis=1)
     values = np.hstack([poses[:, :3, 3], q_wxyz, truth.v_world, truth.bias[:, 3:], truth.bias[:, :3]])
@@ -229,27 +244,10 @@ def _table(t_ns: list[int], heading: str, values: Array) -> str:
     return f"#timestamp{heading}\n{''.join(rows)}"
 
 
-def _sensor_yaml(kind: str, T_imu_sensor: Array) -> str:
+def _sensor_yaml(kind: str, T_imu_sensor: Array, **fields: object) -> str:
     data = ", ".join(f"{x:.15g}" for x in T_imu_sensor.ravel())
-    return f"%YAML:1.0\nsensor_type: {kind}\ncomment: simulated\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
-
-
-def _camera_yaml(camera: Camera, T_imu_cam: Array, rate_hz: float) -> str:
-    return _sensor_yaml("camera", T_imu_cam) + (
-        f"rate_hz: {rate_hz:g}\nresolution: {list(camera.size_px)}\ncamera_model: pinhole\n"
-        f"intrinsics: {list(camera.pinhole_px)}\ndistortion_model: {_EUROC_NAMES[camera.distortion]}\n"
-        f"distortion_coefficients: {camera.coefficients.tolist()}\n"
-    )
-
-
-def _imu_yaml(noise: ImuNoise, rate_hz: float) -> str:
-    return _sensor_yaml("imu", np.eye(4)) + (
-        f"rate_hz: {rate_hz:g}\n"
-        f"gyroscope_noise_density: {noise.gyro_noise_density:g}\n"
-        f"gyroscope_random_walk: {noise.gyro_random_walk:g}\n"
-        f"accelerometer_noise_density: {noise.accel_noise_density:g}\n"
-        f"accelerometer_random_walk: {noise.accel_random_walk:g}\n"
-    )
+    head = f"%YAML:1.0\nsensor_type: {kind}\ncomment: simulated\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
+    return head + "".join(f"{name}: {value}\n" for name, value in fields.items())
 
 
 def is_simulated(root: Path) -> bool:
@@ -263,19 +261,11 @@ def _written_by_us(directory: Path) -> frozenset[str]:
     """Return the file names of a folder that was written here; none without its mark, as it may be a real recording."""
     if not is_simulated(directory):
         return frozenset()
-    tables = [f"mav0/{sensor}/{name}" for sensor in (*_CAMERAS, "imu0", _TRUTH) for name in ("data.csv", "sensor.yaml")]
-    folders = [
-        "mav0/",
-        *(f"mav0/{sensor}/" for sensor in (*_CAMERAS, "imu0", _TRUTH)),
-        *(f"mav0/{c}/data/" for c in _CAMERAS),
-    ]
-    images = [
-        path.relative_to(directory).as_posix()
-        for camera in _CAMERAS
-        for path in (directory / "mav0" / camera / "data").glob("*.png")
-        if path.stem.isdecimal()
-    ]
-    return frozenset({ABOUT, *tables, *folders, *images})
+    sensors = (*_CAMERAS, "imu0", _TRUTH)
+    tables = [f"mav0/{sensor}/{name}" for sensor in sensors for name in ("", "data.csv", "sensor.yaml")]
+    images = [path for c in _CAMERAS for path in directory.glob(f"mav0/{c}/data/*.png") if path.stem.isdecimal()]
+    folders = ["mav0/", *(f"mav0/{c}/data/" for c in _CAMERAS)]
+    return frozenset({ABOUT, *folders, *tables, *(path.relative_to(directory).as_posix() for path in images)})
 
 
 def errors_px(sequence: Sequence) -> Array:

@@ -37,6 +37,8 @@ _NEAREST_M = 0.05
 _NEARNESS_OF_NOTHING = 1e-6
 # The optics' own blur, as a Gaussian (px).
 _OPTICS_PX = 0.6
+# Noise of the sensor: sigma in the dark (grey values), and variance for each grey value of light, as photons have.
+_DARK_SIGMA, _VARIANCE_PER_GREY = 1.2, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ def furnished_hall(moving: int = 0) -> Surfaces:
     ``moving`` crates fly circles between the camera and the walls, at walking pace.
     """
     rng = np.random.default_rng(_WORLD_SEED)
-    standing = (*_walls(rng), *_posters(rng), *_pillars(rng), *_crates(rng), *_lamps(rng))
+    standing = (*_walls(rng), *_posters(rng), *_furniture(rng))
     return Surfaces(standing, _circling(moving, rng) if moving else None)
 
 
@@ -146,32 +148,27 @@ def box(size_m: Array, rng: np.random.Generator) -> tuple[Panel, ...]:
     return tuple(faces)
 
 
-def _standing(size_m: Array, centre_m: Array, yaw_rad: float, rng: np.random.Generator) -> Iterator[Panel]:
-    pose = se3(about_z(yaw_rad), centre_m)
-    return (face.moved(pose) for face in box(size_m, rng))
+def _furniture(rng: np.random.Generator) -> Iterator[Panel]:
+    """Yield pillars, crates on the floor, and lamps that hang from the ceiling, above where the camera flies.
 
+    Crates where it flies are low enough to be flown over.
+    """
 
-def _pillars(rng: np.random.Generator) -> Iterator[Panel]:
+    def standing(size_m: Array, centre_m: Array, yaw_rad: float) -> Iterator[Panel]:
+        return (face.moved(se3(about_z(yaw_rad), centre_m)) for face in box(size_m, rng))
+
     height_m = HALL_UPPER_M[2]
     for x, y in ((3.6, 3.4), (-3.5, 3.7), (-3.7, -3.3), (3.4, -3.6)):
-        yield from _standing(np.array([0.45, 0.45, height_m]), np.array([x, y, 0.5 * height_m]), 0.0, rng)
-
-
-def _crates(rng: np.random.Generator) -> Iterator[Panel]:
-    """Yield crates on the floor; those where the camera flies are low enough to be flown over."""
+        yield from standing(np.array([0.45, 0.45, height_m]), np.array([x, y, 0.5 * height_m]), 0.0)
     for _ in range(_CRATES):
         place_m = rng.uniform(-4.2, 4.2, 2)
         below = np.abs(place_m).max() < _FLOWN_M + 0.7
         size_m = np.append(rng.uniform(0.4, 0.9, 2), rng.uniform(0.3, 0.7 if below else 1.6))
-        yield from _standing(size_m, np.append(place_m, 0.5 * size_m[2]), float(rng.uniform(0.0, np.pi)), rng)
-
-
-def _lamps(rng: np.random.Generator) -> Iterator[Panel]:
-    """Yield boxes that hang from the ceiling, above where the camera flies."""
+        yield from standing(size_m, np.append(place_m, 0.5 * size_m[2]), float(rng.uniform(0.0, np.pi)))
     for _ in range(_LAMPS):
         size_m = np.append(rng.uniform(0.3, 0.9, 2), rng.uniform(0.1, 0.3))
         place_m = np.append(rng.uniform(-4.0, 4.0, 2), rng.uniform(3.7, 4.1))
-        yield from _standing(size_m, place_m, float(rng.uniform(0.0, np.pi)), rng)
+        yield from standing(size_m, place_m, float(rng.uniform(0.0, np.pi)))
 
 
 def _circling(count: int, rng: np.random.Generator) -> Callable[[float], tuple[Panel, ...]]:
@@ -411,32 +408,22 @@ def _at_level(kept: Atlas, level: Floats, u: Floats, v: Floats, column: Floats) 
     level_index = level.astype(np.intp)
     scale = np.exp2(-level)
     size = np.float32(TEXELS) * scale
-    columns, rows = (_wrapped(place * scale - np.float32(0.5), size) for place in (u, v))
+    columns, rows = (place * scale - np.float32(0.5) for place in (u, v))
+    columns -= size * np.floor(columns / size)  # numpy.mod takes ten times as long
+    rows -= size * np.floor(rows / size)
     columns += column
     rows += kept.first_row[level_index]
     return np.asarray(cv2.remap(kept.image, columns, rows, cv2.INTER_LINEAR), dtype=np.float32)
 
 
-def _wrapped(x: Floats, period: Floats) -> Floats:
-    """Return x modulo the period, in a tenth of the time that numpy.mod takes."""
-    return np.asarray(x - period * np.floor(x / period), dtype=np.float32)
+def developed(light: Floats, exposure: float, rng: np.random.Generator) -> Grey:
+    """Return the image of 8 bits of the light times the exposure, with the sensor's noise."""
+    import cv2
 
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviation in the dark (grey values), and variance for each grey value of light, as photon noise has."""
-
-    dark_sigma: float = 1.2
-    variance_per_grey: float = 0.02
-
-    def developed(self, light: Floats, exposure: float, rng: np.random.Generator) -> Grey:
-        """Return the image of 8 bits of the light times the exposure."""
-        import cv2
-
-        sharp = np.asarray(cv2.GaussianBlur(light, (0, 0), _OPTICS_PX), dtype=np.float32) * np.float32(exposure)
-        sigma = np.sqrt(np.float32(self.dark_sigma**2) + np.float32(self.variance_per_grey) * sharp)
-        noisy = sharp + sigma * rng.standard_normal(sharp.shape, dtype=np.float32)
-        return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+    sharp = np.asarray(cv2.GaussianBlur(light, (0, 0), _OPTICS_PX), dtype=np.float32) * np.float32(exposure)
+    sigma = np.sqrt(np.float32(_DARK_SIGMA**2) + np.float32(_VARIANCE_PER_GREY) * sharp)
+    noisy = sharp + sigma * rng.standard_normal(sharp.shape, dtype=np.float32)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
 
 
 def exposed(shot: Callable[[float], Floats], t_s: float, exposure_s: float, shots: int) -> Floats:

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, IntArray, about_z, se3, so3_exp, so3_log
+from toolkit.geometry import Array, IntArray, about_z, se3, so3_exp, so3_log
 
 SPLINE_ORDER = 6  # control points that act at one instant; the degree is one less
 _WORLD_SEED = 20  # draws the landmarks, the same for every seed of a scenario
@@ -300,6 +300,8 @@ def roadside(path: Array, per_pose: int, rng: np.random.Generator) -> Array:
     They lie 3.5 to 22 m to a side and from the road's surface to 6 m above the poses, more of them low and
     near; none stands within 3 m of the path, where the car would drive through it.
     """
+    from scipy.spatial import KDTree  # 7 MB, which no process that only runs estimators needs
+
     count = len(path) * per_pose
     share = rng.uniform(size=(count, 4))
     side = np.where(share[:, 0] < 0.5, -1.0, 1.0)
@@ -308,17 +310,8 @@ def roadside(path: Array, per_pose: int, rng: np.random.Generator) -> Array:
     )
     pose = np.repeat(path, per_pose, axis=0)
     points = (pose[:, :3, :3] @ offset_m[:, :, None])[:, :, 0] + pose[:, :3, 3]
-    return points[~_near_path(points, path, 3.0)]
-
-
-def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
-    """Say which points (M, 3) are within a radius of the path (N, 4, 4), seen from above.
-
-    The nearest pose is looked up first, because all distances between an hour's path and its points would take 25 GB.
-    """
+    # The nearest pose is looked up, because all distances between an hour's path and its points would take 25 GB.
     along = path[:, :2, 3]
-    from scipy.spatial import KDTree  # 7 MB, which no process that only runs estimators needs
-
     _, nearest = KDTree(along).query(points[:, :2])
-    squared = ((points[:, :2] - along[nearest]) ** 2).sum(axis=-1)
-    return np.asarray(squared < radius_m**2)
+    squared_m2 = ((points[:, :2] - along[nearest]) ** 2).sum(axis=-1)
+    return np.asarray(points[squared_m2 >= 3.0**2])

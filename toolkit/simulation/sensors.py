@@ -110,23 +110,17 @@ def imu_stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
 def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
     """Say for each of K poses (K, 4, 4) and M landmarks (M, 3) whether the pair sees it, (K, M)."""
     T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
+    least, right, bottom = camera.border_px, *(size - 1 - camera.border_px for size in camera.size_px)
     seen = np.empty((len(T_world_imu), len(points)), dtype=bool)
     for begin in range(0, len(T_world_imu), _POSES_AT_ONCE):
         T = T_cam_world[begin : begin + _POSES_AT_ONCE]
         points_cam = np.swapaxes(T[:, :3, :3] @ points.T + T[:, :3, 3:], 1, 2)
-        seen[begin : begin + _POSES_AT_ONCE] = _in_view(points_cam, rig, camera)
+        in_view = (points_cam[..., 2] >= camera.depth_m[0]) & (points_cam[..., 2] <= camera.depth_m[1])
+        u_left, u_right, v = project(points_cam[in_view], rig).T
+        # With a positive baseline uR < uL, so two of the four horizontal limits imply the others.
+        in_view[in_view] = (u_right >= least) & (u_left <= right) & (v >= least) & (v <= bottom)
+        seen[begin : begin + _POSES_AT_ONCE] = in_view
     return seen
-
-
-def _in_view(points_cam: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
-    depth = points_cam[..., 2]
-    in_depth = (depth >= camera.depth_m[0]) & (depth <= camera.depth_m[1])
-    result = np.zeros(depth.shape, dtype=bool)
-    u_left, u_right, v = project(points_cam[in_depth], rig).T
-    right, bottom = camera.size_px[0] - 1 - camera.border_px, camera.size_px[1] - 1 - camera.border_px
-    # With a positive baseline uR < uL, so two of the four horizontal limits imply the others.
-    result[in_depth] = (u_right >= camera.border_px) & (u_left <= right) & (v >= camera.border_px) & (v <= bottom)
-    return result
 
 
 @dataclass(frozen=True, eq=False)
