@@ -25,7 +25,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import gtsam
 import numpy as np
@@ -89,7 +89,7 @@ def _of_groups(
     holds_in_time = has_velocity or any(last - first > _STANDING for first, last in spans.values())
     for order, checked in (in_time, dissected) if holds_in_time else (dissected, in_time):
         try:
-            covs = _recovered(_eliminated(tied, order()), together)
+            covs = _recovered(_eliminated(tied, order(), together), together)
             pairs = zip(checked, _variances(linear, [states[k] for k in checked]), strict=True)
             if all(np.allclose(np.diag(covs[k]), known, rtol=2.0 * _MOST_ROUNDED, atol=0.0) for k, known in pairs):
                 return covs
@@ -183,15 +183,17 @@ def _spans(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) ->
     """Return the first and the last group with which each variable outside all groups shares a factor."""
     place = {key: i for i, group in enumerate(groups) for key in group}
     # As arrays: a long recording has a hundred thousand factors.
-    each = [graph.at(i).keys() for i in range(graph.size())]
-    keys, factor = list(chain.from_iterable(each)), np.repeat(np.arange(len(each)), list(map(len, each)))
-    group_of = np.array([place.get(key, -1) for key in keys])
+    count = graph.size()
+    keys = np.fromiter(chain.from_iterable(graph.at(i).keys() for i in range(count)), np.int64)
+    factor = np.repeat(np.arange(count), [graph.at(i).size() for i in range(count)])
+    different, row = np.unique(keys, return_inverse=True)
+    group_of = np.array([place.get(key, -1) for key in different.tolist()])[row]
     inside = group_of >= 0
-    low, high = np.full(len(each), len(groups)), np.full(len(each), -1)
+    low, high = np.full(count, len(groups)), np.full(count, -1)
     np.minimum.at(low, factor[inside], group_of[inside])
     np.maximum.at(high, factor[inside], group_of[inside])
     shared = ~inside & (high[factor] >= 0)
-    others, row = np.unique(np.array(keys, dtype=np.int64)[shared], return_inverse=True)
+    others, row = np.unique(keys[shared], return_inverse=True)
     first, last = np.full(others.size, len(groups)), np.full(others.size, -1)
     np.minimum.at(first, row, low[factor[shared]])
     np.maximum.at(last, row, high[factor[shared]])
@@ -208,28 +210,54 @@ def _others(ordering: gtsam.Ordering, without: Collection[int]) -> list[int]:
     return [key for key in (ordering.at(i) for i in range(ordering.size())) if key not in left_out]
 
 
-def _eliminated(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
-    """Return each variable's conditional on later ones, in the order of elimination."""
-    net = graph.eliminateSequential(ordering)
-    return [net.at(i) for i in range(net.size())]
+def _eliminated(
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, together: Iterable[Sequence[int]]
+) -> list[gtsam.GaussianConditional]:
+    """Return the conditionals on later variables, in the order of elimination, of groups and of what these depend on.
+
+    Those of the other variables, landmarks mostly, are not kept: of a minute indoors they are 150 MB.
+    """
+    net, kept = graph.eliminateSequential(ordering), list[gtsam.GaussianConditional]()
+    needed = {key for group in together for key in group}
+    for conditional in (net.at(i) for i in range(net.size())):
+        if conditional.firstFrontalKey() in needed:
+            needed.update(conditional.keys())
+            kept.append(conditional)
+    return kept
 
 
 class _Clique(NamedTuple):
-    """Variables, eliminated one after the other, that depend on the same later ones: x = gain @ x_later + n.
+    """Conditionals of variables, eliminated one after the other, that depend on the same later ones.
 
-    ``sizes`` are their dimensions (f in all) by key, ``later`` the keys of those that they depend on (m in all),
-    ``gain`` (f, m) is in that order, and ``cov`` (f, f) that of n.
+    ``sizes`` are the variables' dimensions (f in all) by key, ``later`` the keys of those that they depend on.
     """
 
+    conditionals: Sequence[gtsam.GaussianConditional]
     sizes: dict[int, int]
     later: list[int]
-    gain: Array
-    cov: Array
+
+    @classmethod
+    def of(cls, conditionals: Sequence[gtsam.GaussianConditional]) -> Self:
+        sizes = {one.firstFrontalKey(): len(one.R()) for one in conditionals}
+        return cls(conditionals, sizes, list(conditionals[-1].keys())[1:])
+
+    def gain_and_cov(self, later_sizes: dict[int, int]) -> tuple[Array, Array]:
+        """Return the gain (f, m) and the covariance (f, f) of n: ``R x = -S x_later + e`` as ``x = gain x_later + n``.
+
+        They are made when they are needed: those of all cliques together take as much memory as their conditionals.
+        """
+        columns, size = _rows(self.sizes | later_sizes), sum(self.sizes.values())
+        terms = np.zeros((size, size + sum(later_sizes.values())))
+        for conditional in self.conditionals:
+            key, *after = conditional.keys()
+            terms[np.ix_(columns[key], columns[key])] = conditional.R()
+            terms[np.ix_(columns[key], _together(columns, after))] = conditional.S()
+        root = np.linalg.inv(terms[:, :size])
+        return -root @ terms[:, size:], root @ root.T
 
 
 def _cliques(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Clique]:
     """Return conditionals as cliques, in the order of elimination."""
-    sizes = {one.firstFrontalKey(): len(one.R()) for one in conditionals}
     parts, later = list[list[gtsam.GaussianConditional]](), frozenset[int]()
     for conditional in conditionals:
         key, *after = conditional.keys()
@@ -238,22 +266,7 @@ def _cliques(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Clique]
         else:
             parts.append([conditional])
         later = frozenset(after)
-    return [_clique(part, sizes) for part in parts]
-
-
-def _clique(conditionals: Sequence[gtsam.GaussianConditional], sizes: Mapping[int, int]) -> _Clique:
-    """Return conditionals, each on the next one's variable and parents, as one: R x = -S x_later + e."""
-    own = {one.firstFrontalKey(): sizes[one.firstFrontalKey()] for one in conditionals}
-    later = list(conditionals[-1].keys())[1:]
-    columns = _rows(own | {key: sizes[key] for key in later})
-    size = sum(own.values())
-    terms = np.zeros((size, sum(map(len, columns.values()))))
-    for conditional in conditionals:
-        key, *after = conditional.keys()
-        terms[np.ix_(columns[key], columns[key])] = conditional.R()
-        terms[np.ix_(columns[key], _together(columns, after))] = conditional.S()
-    root = np.linalg.inv(terms[:, :size])
-    return _Clique(own, later, -root @ terms[:, size:], root @ root.T)
+    return [_Clique.of(part) for part in parts]
 
 
 class _Joint(NamedTuple):
@@ -269,10 +282,11 @@ class _Joint(NamedTuple):
 
     def extended(self, clique: _Clique) -> "_Joint":
         """Return the joint covariance of a clique and of what it depends on, all of which must be present."""
-        later = self.of(clique.later)
-        across = clique.gain @ later
-        cov = np.block([[clique.cov + across @ clique.gain.T, across], [across.T, later]])
-        return _Joint(_rows(clique.sizes | {key: len(self.rows[key]) for key in clique.later}), cov)
+        later, later_sizes = self.of(clique.later), {key: len(self.rows[key]) for key in clique.later}
+        gain, own = clique.gain_and_cov(later_sizes)
+        across = gain @ later
+        cov = np.block([[own + across @ gain.T, across], [across.T, later]])
+        return _Joint(_rows(clique.sizes | later_sizes), cov)
 
 
 def _rows(sizes: Mapping[int, int]) -> dict[int, range]:
@@ -286,12 +300,8 @@ def _together(rows: Mapping[int, range], keys: Iterable[int]) -> list[int]:
 
 def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence[Sequence[int]]) -> list[Array]:
     """Return the joint covariance of each group of variables, from the conditionals in the order of elimination."""
-    later_of = {key: later for key, *later in (one.keys() for one in conditionals)}
-    place = {key: i for i, key in enumerate(later_of)}
-    needed = {key for group in together for key in group}
-    for key, later in later_of.items():
-        needed.update(later if key in needed else ())
-    cliques = _cliques([one for one, key in zip(conditionals, later_of, strict=True) if key in needed])
+    place = {one.firstFrontalKey(): i for i, one in enumerate(conditionals)}
+    cliques = _cliques(conditionals)
     clique_of = {key: i for i, clique in enumerate(cliques) for key in clique.sizes}
     # The first variable that a clique depends on depends itself on all the others.
     next_of = [clique_of[min(one.later, key=place.__getitem__)] if one.later else None for one in cliques]
