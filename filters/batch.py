@@ -122,7 +122,10 @@ class Batch:
         all_frames = [packet.frame for packet in self._packets]
         track_ids = worth_smoothing(all_frames, known)
         frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
-        smoothed = self._solved(frames, self._start(known, track_ids))
+        start = self._start(known, track_ids)
+        # The first elimination takes the most memory of a run: what it does not need goes before.
+        del self._causal_pass, self._map, self._estimates[:-1]
+        smoothed = self._solved(frames, start)
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         trajectory, log = with_covariances(Trajectory.of(states), smoothed.linear, self._motion)

@@ -321,7 +321,8 @@ class _Steps:
 def _damping_factors(sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
     """Return factors that damp variables, whose keys have sizes, at their values."""
     graph = gtsam.GaussianFactorGraph()
-    of_size = {size: np.sqrt(damping) * np.eye(size) for size in set(sizes.values())}
+    parts = {size: (np.sqrt(damping) * np.eye(size), np.zeros(size)) for size in set(sizes.values())}
+    units = {size: gtsam.noiseModel.Unit.Create(size) for size in parts}
     for key, size in sizes.items():
-        graph.add(key, of_size[size], np.zeros(size), gtsam.noiseModel.Unit.Create(size))
+        graph.add(key, *parts[size], units[size])
     return graph
