@@ -536,9 +536,9 @@ def eliminate_tracks(
 
     Returns the landmarks (F, 3); which are reliable (F,) (the other results are undefined for the others); the NIS (F,)
     and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not far above its bound; the weight
-    (F,), 0 of a track that is not accepted; and the normal equations of the G accepted, weighted: ``[H_f r]^T [H_f r]``
-    (G, 4, 4), E (3 G, 6 W) and e (3 G,) of :func:`eliminate`, ``H_x^T H_x``, one block (W, 6, 6) a pose, and ``H_x^T
-    r`` (6 W,).
+    (F,), 0 of a track that is not accepted; and the normal equations of the accepted, weighted: ``[H_f r]^T [H_f r]``
+    (F, 4, 4), E (3 F, 6 W) and e (3 F,) of :func:`eliminate`, zero for the others, ``H_x^T H_x``, one block (W, 6, 6) a
+    pose, and ``H_x^T r`` (6 W,).
     """
     uvs_px, seen = sightings
     mismatched_factor, common_weight = factors
@@ -556,7 +556,7 @@ def eliminate_tracks(
     N, E, e = np.zeros((count, 4, 4)), np.zeros((3 * count, 2 * most)), np.zeros(3 * count)
     D, d, where = np.zeros((longest, 6, 6)), np.zeros(2 * most), np.empty(longest, dtype=np.int64)
     A, J, whitened, B = np.empty((most, 4)), np.empty((most, 6)), np.empty((most, 4)), np.empty((most, 4))
-    S, V, g = np.empty((most, most)), np.empty((3, most)), 0
+    S, V = np.empty((most, most)), np.empty((3, most))
     for f in range(count):
         m = sighted(seen, f, where)
         n, nis[f], dof[f], worst[f] = 3 * m, np.inf, 3 * m - 3, -1
@@ -579,15 +579,14 @@ def eliminate_tracks(
         weights[f] = common_weight * weight_of(nis[f], dof[f], weigher)
         if weights[f] > 0.0:
             scale((A, J), 0, n, weights[f])
-            add_normals(A, 0, n, N, g)
+            add_normals(A, 0, n, N, f)
             for k in range(m):
                 add_pose((A, J), 3 * k, D, d, where[k])
-                add_cross((A, J), 3 * k, E, g, where[k])
-            eliminate(g, N, E, 2 * most, e)
-            g += 1
+                add_cross((A, J), 3 * k, E, f, where[k])
+            eliminate(f, N, E, 2 * most, e)
         elif nis[f] > mismatched_factor * weigher[0][dof[f]]:
             worst[f] = where[worst_sighting(S, m, V, whitened, B)]
-    return points, reliable, nis, dof, worst, weights, (N[:g], E[: 3 * g], e[: 3 * g], D, d)
+    return points, reliable, nis, dof, worst, weights, (N, E, e, D, d)
 
 
 @compiled

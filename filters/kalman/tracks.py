@@ -182,7 +182,7 @@ def _tested(
     """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, if any."""
     from filters.kalman import kernels
 
-    width = sightings.seen.shape[1]
+    count, width = sightings.seen.shape
     points, reliable, nis, dof, worst, weights, (normals, halves, of_halves, blocks, vector) = kernels.eliminate_tracks(
         (sightings.uvs_px, sightings.seen),
         (window.poses, window.poses_at),
@@ -198,8 +198,8 @@ def _tested(
         sightings.track_ids[accepted],
         sightings.seen[accepted],
         points[accepted],
-        normals,
-        halves.reshape(len(normals), 3, 6 * width),
+        normals[accepted],
+        halves.reshape(count, 3, 6 * width)[accepted],
         blocks,
         vector - halves.T @ of_halves,
     )
