@@ -86,17 +86,13 @@ def _still(images: tuple[Image, Image], tracks: ImageTracks, k: int) -> Image:
     now = rows[tracks.frame[rows] == k]
     for row in now.tolist():
         past = rows[tracks.track_id[rows] == tracks.track_id[row]]
-        colour = _colour(past.size)
+        # By the number of frames it was seen in: from blue over green to red.
+        share = min(past.size / _OLD, 1.0)
+        blue, red = max(1.0 - 2.0 * share, 0.0), max(2.0 * share - 1.0, 0.0)
+        colour = round(255 * blue), round(255 * (1.0 - blue - red)), round(255 * red)
         way = np.rint(tracks.corners_px[past[-_TRAIL:], :2]).astype(np.int32)
         cv2.polylines(canvas, [way[:, None]], False, colour, 1, cv2.LINE_AA)
         left, right = tracks.corners_px[row, :2], tracks.corners_px[row, 2:] + [images[0].shape[1], 0.0]
         for place in (left, right):
             cv2.circle(canvas, np.rint(place).astype(int).tolist(), 3, colour, 1, cv2.LINE_AA)
     return np.asarray(canvas, dtype=np.uint8)
-
-
-def _colour(age: int) -> tuple[int, int, int]:
-    """Return blue, green and red of a track by the number of frames it was seen in: from blue over green to red."""
-    share = min(age / _OLD, 1.0)
-    blue, red = max(1.0 - 2.0 * share, 0.0), max(2.0 * share - 1.0, 0.0)
-    return round(255 * blue), round(255 * (1.0 - blue - red)), round(255 * red)

@@ -104,7 +104,10 @@ class Tracker:
         self._motion = StereoMotion(self.rig.stereo_rig, self.rig.size_px, requested.ransac_px)
         self._rigidity = Rigidity(self.rig.stereo_rig, requested.ransac_px)
         self._seen = self.rig.seen(0), self.rig.seen(1)
-        self._grid = grid_of(self.rig.size_px, requested.max_tracks)
+        # A grid of nearly square cells, such that each holds about four tracks.
+        width, height = self.rig.size_px
+        rows = max(round(float(np.sqrt(0.25 * requested.max_tracks * height / width))), 2)
+        self._grid = rows, max(round(rows * width / height), 2)
 
     def step(self, left: Image, right: Image) -> TrackedCorners | None:
         """Follow the tracks into the next pair and begin new ones.
@@ -186,11 +189,12 @@ class Tracker:
         wanted = self.settings.max_tracks - int(tracks.sound.sum())
         if wanted <= 0:
             return _NO_TRACKS
-        present = count_in_cells(tracks.left_px, self.rig.size_px, self._grid)
+        cells = _cells_of(tracks.left_px, self.rig.size_px, self._grid)
+        present = np.bincount(cells, minlength=self._grid[0] * self._grid[1]).reshape(self._grid)
         free = self._free(tracks.left_px)
         places_px = corners(left, free, present, self.settings.spacing_px, _CANDIDATES * wanted)
         self.tried += len(places_px)
-        near_px, found = match_rows(halved(left), halved(right), places_px, self._most_disparity_px)
+        near_px, found = match_rows(left, right, places_px, self._most_disparity_px)
         rows = np.flatnonzero(found)
         right_px, paired = self._found_right(left, right, places_px[rows], near_px[rows])
         found[rows] = paired
@@ -249,59 +253,34 @@ def corners(image: Image, free: BoolArray, present: IntArray, spacing_px: float,
     return points[chosen[:most]]
 
 
-def grid_of(size_px: tuple[int, int], tracks: int) -> tuple[int, int]:
-    """Return rows and columns of a grid of nearly square cells, such that each holds about four tracks."""
-    width, height = size_px
-    rows = max(round(float(np.sqrt(0.25 * tracks * height / width))), 2)
-    return rows, max(round(rows * width / height), 2)
-
-
-def count_in_cells(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
-    """Return how many points (N, 2) lie in each cell (rows, columns)."""
-    cells = _cells_of(points_px, size_px, grid)
-    return np.bincount(cells, minlength=grid[0] * grid[1]).reshape(grid)
-
-
 def _cells_of(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
     column = np.clip(points_px[:, 0] * grid[1] / size_px[0], 0, grid[1] - 1).astype(np.int64)
     row = np.clip(points_px[:, 1] * grid[0] / size_px[1], 0, grid[0] - 1).astype(np.int64)
     return row * grid[1] + column
 
 
-def halved(image: Image) -> Image:
-    import cv2
-
-    return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
-
-
 def match_rows(left: Image, right: Image, points_px: Array, most_disparity_px: float) -> tuple[Array, BoolArray]:
     """Return where points (N, 2) px of a rectified left image are in the right one, to 2 px, and if found (N,).
 
-    The images are halved ones, the points those of the whole left image.
+    Both images are halved, and the best match in the row is sought.
     """
-    places, found = points_px.copy(), np.zeros(len(points_px), dtype=bool)
-    search_px = int(np.ceil(0.5 * most_disparity_px))
-    for i, (x, y) in enumerate(np.rint(0.5 * points_px).astype(int).tolist()):
-        match = _best(left, right, x, y, search_px)
-        if match is not None:
-            places[i, 0] += 2.0 * match
-            found[i] = True
-    return places, found
-
-
-def _best(left: Image, right: Image, x: int, y: int, search_px: int) -> int | None:
-    """Return by how many pixels the best match in the row lies off the point, or None where nothing is alike."""
     import cv2
 
-    height, width = left.shape
-    lower, upper = y - _HALF_PX - _ROWS_PX, y + _HALF_PX + _ROWS_PX + 1
-    first, last = max(x - search_px - _HALF_PX, 0), min(x + _HALF_PX + 1, width)
-    if lower < 0 or upper > height or x - _HALF_PX < 0 or last - first < 2 * _HALF_PX + 1 or x + _HALF_PX >= width:
-        return None
-    template = left[y - _HALF_PX : y + _HALF_PX + 1, x - _HALF_PX : x + _HALF_PX + 1]
-    alike = cv2.matchTemplate(right[lower:upper, first:last], template, cv2.TM_CCOEFF_NORMED)
-    _, best, _, (column, _row) = cv2.minMaxLoc(alike)
-    return first + column + _HALF_PX - x if best > _LEAST_CORRELATION else None
+    left, right = (np.asarray(cv2.pyrDown(image), dtype=np.uint8) for image in (left, right))
+    places, found = points_px.copy(), np.zeros(len(points_px), dtype=bool)
+    search_px, (height, width) = int(np.ceil(0.5 * most_disparity_px)), left.shape
+    for i, (x, y) in enumerate(np.rint(0.5 * points_px).astype(int).tolist()):
+        lower, upper = y - _HALF_PX - _ROWS_PX, y + _HALF_PX + _ROWS_PX + 1
+        first, last = max(x - search_px - _HALF_PX, 0), min(x + _HALF_PX + 1, width)
+        if lower < 0 or upper > height or x - _HALF_PX < 0 or last - first < 2 * _HALF_PX + 1 or x + _HALF_PX >= width:
+            continue
+        template = left[y - _HALF_PX : y + _HALF_PX + 1, x - _HALF_PX : x + _HALF_PX + 1]
+        alike = cv2.matchTemplate(right[lower:upper, first:last], template, cv2.TM_CCOEFF_NORMED)
+        _, best, _, (column, _row) = cv2.minMaxLoc(alike)
+        if best > _LEAST_CORRELATION:
+            places[i, 0] += 2.0 * (first + column + _HALF_PX - x)
+            found[i] = True
+    return places, found
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, skew, so3_exp
+from toolkit.geometry import Array, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics.parts.evaluation import AgainstTruth, Matched, fit_se3, lengths, rmse
@@ -103,22 +103,16 @@ def score(evaluation: AgainstTruth) -> Scores:
     return scores.remarked([OFFSET], _REMARK.format(offset_ms, error_ms, fit.after_m, fit.before_m))
 
 
-def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
-    """Return the times (n,) s of pairs, and which are no farther apart than usual; raise Unavailable where few are."""
-    t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
-    wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
-    usable = ~(np.append(wide, False) | np.insert(wide, 0, False))
-    if usable.sum() < _FEWEST_PAIRS:
-        raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
-    return t_s, usable
-
-
 def _fit(pairs: Matched, with_rate: bool) -> _Fit:
     """Fit a clock by Gauss-Newton, a rate from the middle of the time outwards; raise Unavailable where none fits."""
     from scipy.interpolate import CubicSpline  # slow to import, and most processes do not need it
 
     true, estimated = pairs.positions
-    t_s, usable = _usable(pairs)
+    t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
+    wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
+    usable = ~(np.append(wide, False) | np.insert(wide, 0, False))
+    if usable.sum() < _FEWEST_PAIRS:
+        raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
     path, middle_s = CubicSpline(t_s, true), 0.5 * t_s[-1]
     since_s = np.vander(t_s - middle_s, 2, increasing=True)[:, : 1 + with_rate]
     clock = np.zeros(1 + with_rate)

@@ -7,7 +7,6 @@ nominal length; the mean is over all segments of all lengths.
 """
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -55,13 +54,6 @@ _LATEST_IN_STEPS = 1.5
 _LONGEST_OVER_INTERVAL = 1.1
 
 
-class _Intervals(NamedTuple):
-    """Indices (p,), (p,) of the first and last matched pair of each interval."""
-
-    first: IntArray
-    last: IntArray
-
-
 def score(evaluation: AgainstTruth) -> Scores:
     errors_of_a_second = cache(lambda: relative_errors(evaluation.oriented, *_one_second(evaluation.oriented)))
     rpe = evaluate(
@@ -88,28 +80,31 @@ def _kitti(matched: Matched) -> Scores:
     return Scores({"kitti_t_percent": 100.0 * float(t_per_m.mean()), "kitti_r_deg_per_m": float(r_deg_per_m.mean())})
 
 
-def _one_second(matched: Matched) -> _Intervals:
+def _one_second(matched: Matched) -> tuple[IntArray, IntArray]:
     """Pair each stamp with the first one a second later, allowing for rounding of the stamps."""
     latest_ns = NS_PER_S + _LATEST_IN_STEPS * median_period_ns(matched.t_ns)
-    intervals = _first_reaching(matched.t_ns, NS_PER_S - STAMP_TOLERANCE_NS, latest_ns)
-    if not intervals.first.size:
+    first, last = _first_reaching(matched.t_ns, NS_PER_S - STAMP_TOLERANCE_NS, latest_ns)
+    if not first.size:
         raise Unavailable("no two matched poses are 1 s apart")
-    return intervals
+    return first, last
 
 
 def _hundred_metres_percent(matched: Matched) -> float:
     """Return the RMSE of the translation error from each stamp to the first one 100 m further along the truth."""
-    intervals = _first_reaching(matched.path_m, INTERVAL_M, _LONGEST_OVER_INTERVAL * INTERVAL_M)
-    if not intervals.first.size:
+    first, last = _first_reaching(matched.path_m, INTERVAL_M, _LONGEST_OVER_INTERVAL * INTERVAL_M)
+    if not first.size:
         length_m = matched.path_m[-1] - matched.path_m[0]
         raise Unavailable(f"no two matched poses are 100 m apart; the matched path is {length_m:.1f} m")
-    return rmse(lengths(relative_errors(matched, *intervals)[:, :3, 3])) / INTERVAL_M * 100.0
+    return rmse(lengths(relative_errors(matched, first, last)[:, :3, 3])) / INTERVAL_M * 100.0
 
 
-def _first_reaching(along: Array | IntArray, least: float, most: float) -> _Intervals:
-    """Pair each of the ascending values (n,) with the first at least ``least`` beyond; drop pairs beyond ``most``."""
+def _first_reaching(along: Array | IntArray, least: float, most: float) -> tuple[IntArray, IntArray]:
+    """Pair each of the ascending values (n,) with the first at least ``least`` beyond, but for pairs beyond ``most``.
+
+    Return the indices (p,), (p,) of both.
+    """
     last = np.searchsorted(along, along + least)
     first = np.flatnonzero(last < along.size)
     last = last[first]
     near = along[last] - along[first] <= most
-    return _Intervals(first[near], last[near])
+    return first[near], last[near]

@@ -73,11 +73,6 @@ def noise_free(scenario: Scenario) -> Scenario:
     return replace(exact, motion=replace(exact.motion, rate_hz=1000.0)) if isinstance(exact.motion, Imu) else exact
 
 
-def _number(name: str) -> int:
-    """Return the number by which a name enters the seeds: 0 for drive, whose draws depend on the seed alone."""
-    return crc32(name.encode()) ^ crc32(b"drive")
-
-
 def simulate(scenario: Scenario, seed: int) -> Sequence:
     """Return the recording of a scenario under one seed; equal arguments give bit-identical recordings.
 
@@ -88,7 +83,9 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
             f"a simulation of {scenario.duration_s:g} s is not possible; its duration is from "
             f"{1.0 / scenario.camera.rate_hz:g} to {LONGEST_S:g} s"
         )
-    streams = np.random.SeedSequence((seed, _number(scenario.name))).spawn(7)
+    # The number by which a name enters the seeds is 0 for drive, whose draws depend on the seed alone.
+    number = crc32(scenario.name.encode()) ^ crc32(b"drive")
+    streams = np.random.SeedSequence((seed, number)).spawn(7)
     prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng, world_rng, slips_rng = map(
         np.random.default_rng, streams
     )

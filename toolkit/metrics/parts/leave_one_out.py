@@ -40,13 +40,6 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-class PredictedSightings(NamedTuple):
-    """Predicted (uL, uR, v) (N, 3) px, and whether the point is in front (N,)."""
-
-    uv_px: Array
-    in_front: BoolArray
-
-
 class _Projections(NamedTuple):
     """Projections of a point by each view: the image (3, N) in focal lengths from the centre, 1 / z and z > 0 (N,)."""
 
@@ -84,11 +77,6 @@ class Views:
 
     def pixels(self, seen: _Projections) -> Array:
         return np.asarray(self._focal_px * seen.ratio + self._centre_px)
-
-    def predict(self, points: Array) -> PredictedSightings:
-        """Predict each view's measurement from a point of its own (3, N)."""
-        seen = self.project(points)
-        return PredictedSightings(self.pixels(seen).T, seen.in_front)
 
     def contributions(self, points: Array) -> Array:
         """Return each view's part (10, N) of its track's robust problem at the point (3, M): H, g and cost."""
@@ -175,12 +163,12 @@ def errors_left_out(observations: Observations, poses: Array, rig: StereoRig) ->
     if not rows.size:
         return rows, np.empty(0)
     T_world_cam = poses[enough.frame] @ rig.T_imu_cam
-    predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
-    return rows, reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
+    predicted_px, in_front = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
+    return rows, reprojection_errors_px(predicted_px, enough.uv_px, in_front)
 
 
-def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> PredictedSightings:
-    """Predict each sighting (N, 3) px of tracks (N,), sorted by track, from the others of its track.
+def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
+    """Predict each sighting (N, 3) px of tracks (N,), sorted by track, from the others; say if the point is in front.
 
     ``T_world_cam`` (N, 4, 4) is the left camera's pose at each sighting. Every track needs at least two views. The
     results are in the order of the input; they may not be finite where the poses are absurd.
@@ -191,7 +179,8 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     part = np.cumsum(views.count[views.track[again]] - 1) // _VIEWS_AT_A_TIME
     for rows in np.split(again, np.flatnonzero(np.diff(part)) + 1) if again.size else ():
         points[:, rows] = _solve(views.others(rows), points[:, rows], _ITERATIONS_AGAIN)
-    return views.predict(points)
+    seen = views.project(points)
+    return views.pixels(seen).T, seen.in_front
 
 
 def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_front: BoolArray) -> Array:
