@@ -4,20 +4,14 @@ Read ``tracker`` first: it is the algorithm, with ``motion`` and ``patches``. ``
 recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills`` draw what it found.
 """
 
-from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified
-from toolkit.frontend.images import StampedPair, size_of
-from toolkit.frontend.tracking import ImageRecording, ImageTracks, matched_corners, track_images
-
-__all__ = [
-    "Camera",
-    "ImageRecording",
-    "ImageTracks",
-    "Pinhole",
-    "RectifiedPair",
-    "StampedPair",
-    "already_rectified",
-    "matched_corners",
-    "rectified",
-    "size_of",
-    "track_images",
-]
+from toolkit.frontend.cameras import Camera as Camera
+from toolkit.frontend.cameras import Pinhole as Pinhole
+from toolkit.frontend.cameras import RectifiedPair as RectifiedPair
+from toolkit.frontend.cameras import already_rectified as already_rectified
+from toolkit.frontend.cameras import rectified as rectified
+from toolkit.frontend.images import StampedPair as StampedPair
+from toolkit.frontend.images import size_of as size_of
+from toolkit.frontend.tracking import ImageRecording as ImageRecording
+from toolkit.frontend.tracking import ImageTracks as ImageTracks
+from toolkit.frontend.tracking import matched_corners as matched_corners
+from toolkit.frontend.tracking import track_images as track_images

@@ -11,7 +11,7 @@ Lucas-Kanade, forward and backward (Bouguet 2001).
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -73,10 +73,8 @@ class _Tracks:
     def joined(self, others: "_Tracks") -> "_Tracks":
         if len(others.ids) == 0:
             return self
-        joined: dict[str, Any] = {"patches": self.patches.joined(others.patches)}
-        names = vars(self).keys() - joined.keys()
-        joined |= {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in names}
-        return _Tracks(**joined)
+        both = {name: (mine, getattr(others, name)) for name, mine in vars(self).items() if name != "patches"}
+        return _Tracks(patches=self.patches.joined(others.patches), **{k: np.concatenate(v) for k, v in both.items()})
 
 
 _NO_TRACKS = _Tracks(

@@ -204,17 +204,12 @@ def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Pat
         )
         (mav0 / camera / "sensor.yaml").write_text(about)
     imu, sensor, truth = sequence.motion, scenario.motion, sequence.truth
-    assert isinstance(imu, ImuSamples)
-    assert isinstance(sensor, Imu)
-    assert truth is not None
-    assert truth.v_world is not None
-    assert truth.bias is not None
+    assert isinstance(imu, ImuSamples) and isinstance(sensor, Imu)
+    assert truth is not None and truth.v_world is not None and truth.bias is not None
     (mav0 / "imu0").mkdir()
-    (mav0 / "imu0/data.csv").write_text(
-        _table(
-            imu.t_ns.tolist(), _columns(w_RS_S="rad s^-1", a_RS_S="m s^-2"), np.hstack([imu.gyro_radps, imu.accel_mps2])
-        )
-    )
+    heading = _columns(w_RS_S="rad s^-1", a_RS_S="m s^-2")
+    samples = _table(imu.t_ns.tolist(), heading, np.hstack([imu.gyro_radps, imu.accel_mps2]))
+    (mav0 / "imu0/data.csv").write_text(samples)
     stated = {"rate_hz": sensor.rate_hz} | {
         f"{name}_{kind}": getattr(sensor.noise, f"{short}_{kind}")
         for name, short in (("gyroscope", "gyro"), ("accelerometer", "accel"))
@@ -276,14 +271,8 @@ def errors_px(sequence: Sequence) -> Array:
     row, is_true = rows_of(sequence.frames_t_ns, truth.t_ns)
     T_world_cam = np.where(is_true[:, None, None], truth.T_world_imu[row] @ rig.T_imu_cam, np.nan)
     _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
-    rays = np.stack(
-        [
-            (seen.uv_px[first, 0] - rig.cx_px) / rig.fx_px,
-            (seen.uv_px[first, 2] - rig.cy_px) / rig.fy_px,
-            np.ones(first.size),
-        ],
-        axis=1,
-    )
+    u_px, _, v_px = seen.uv_px[first].T
+    rays = np.stack([(u_px - rig.cx_px) / rig.fx_px, (v_px - rig.cy_px) / rig.fy_px, np.ones(first.size)], axis=1)
     points = _met(T_world_cam[seen.frame[first]], rays)
     return seen.uv_px - stereo.project(transform(se3_inverse(T_world_cam)[seen.frame], points[track]), rig)
 

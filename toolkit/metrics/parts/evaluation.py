@@ -157,7 +157,7 @@ def fit_se3(truth: Array, estimate: Array) -> Alignment:
     Raises Unavailable for fewer than three pairs, as do the other fits.
     """
     rotation, d = nearest_rotation(_covariance(truth, estimate))
-    return _centred(truth, estimate, Alignment(rotation, np.zeros(3), 1.0, _is_unique(d)))
+    return _centred(truth, estimate, rotation, is_unique=bool(d[1] > _COLLINEAR * d[0]))
 
 
 def fit_sim3(truth: Array, estimate: Array) -> Alignment:
@@ -166,18 +166,12 @@ def fit_sim3(truth: Array, estimate: Array) -> Alignment:
     variance_m2 = float(np.mean(np.sum((estimate - estimate.mean(axis=0)) ** 2, axis=1)))  # eq. 36
     if variance_m2 == 0.0:
         raise Unavailable("the estimated positions are all the same, so no scale fits them")
-    return _centred(truth, estimate, Alignment(rotation, np.zeros(3), float(d.sum()) / variance_m2, _is_unique(d)))
-
-
-def _is_unique(d: Array) -> bool:
-    """Say whether the covariance with these singular values (3,) leaves one rotation only."""
-    return bool(d[1] > _COLLINEAR * d[0])
+    return _centred(truth, estimate, rotation, float(d.sum()) / variance_m2, bool(d[1] > _COLLINEAR * d[0]))
 
 
 def fit_yaw(truth: Array, estimate: Array) -> Alignment:
     """Fit heading and translation to positions (n, 3) by least squares (Zhang and Scaramuzza 2018)."""
-    rotation = about_z(_best_yaw(_covariance(truth, estimate)))
-    return _centred(truth, estimate, Alignment(rotation, np.zeros(3)))
+    return _centred(truth, estimate, about_z(_best_yaw(_covariance(truth, estimate))))
 
 
 def _covariance(truth: Array, estimate: Array) -> Array:
@@ -196,10 +190,9 @@ def _best_yaw(covariance: Array) -> Array:
     return angle
 
 
-def _centred(truth: Array, estimate: Array, turned: Alignment) -> Alignment:
-    """Give an alignment the translation that maps mean to mean (Umeyama, eq. 41)."""
-    translation = truth.mean(axis=0) - turned.scale * turned.rotation @ estimate.mean(axis=0)
-    return Alignment(turned.rotation, translation, turned.scale, turned.rotation_is_unique)
+def _centred(truth: Array, estimate: Array, rotation: Array, scale: float = 1.0, is_unique: bool = True) -> Alignment:
+    """Return an alignment with the translation that maps mean to mean (Umeyama, eq. 41)."""
+    return Alignment(rotation, truth.mean(axis=0) - scale * rotation @ estimate.mean(axis=0), scale, is_unique)
 
 
 class AgainstTruth:
