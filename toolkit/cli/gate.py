@@ -27,10 +27,10 @@ from toolkit.cli.arguments import (
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
     from toolkit.evaluation.against_baseline import GivenRuns
-    from toolkit.gate.baseline import Baseline, Case
+    from toolkit.gate.baseline import Case
     from toolkit.gate.verdict import Check
     from toolkit.settings import Settings
 
@@ -96,7 +96,12 @@ def baseline(options: argparse.Namespace) -> int:
     made_by = made_here(_command_to_keep(options.command_line))
     made = new_baseline(cases, options.workers or usable_cpus(), made_by, of_this_process(), settings)
     write_text(out, to_text(made))
-    ends = list(_bad_ends(made))
+    ends = [
+        f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {measured.why.get(name, '')}"
+        for case, measured in made.cases
+        for name, series in measured.runs.items()
+        if (bad := sum(status != "ok" for status in series.status))
+    ]
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
     return 1 if ends else 0
 
@@ -179,14 +184,6 @@ def _with_duration(given: str) -> tuple[str, float | None]:
         return (source, positive_seconds(seconds)) if source else (given, None)
     except argparse.ArgumentTypeError:
         return given, None
-
-
-def _bad_ends(baseline: Baseline) -> Iterator[str]:
-    for case, measured in baseline.cases:
-        for name, series in measured.runs.items():
-            if bad := sum(status != "ok" for status in series.status):
-                ends = f"did not end well in {bad} of {len(series.status)} runs"
-                yield f"{case.source}: {name} {ends}: {measured.why.get(name, '')}"
 
 
 @command(

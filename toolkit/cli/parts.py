@@ -46,7 +46,12 @@ def list_parts(options: argparse.Namespace) -> int:
         print("\n".join(_summary(kind, list(entries(kind))) for kind in KINDS))
         print(f"\nvislam list KIND prints one of them: {', '.join(KINDS)}")
     else:
-        print(_listing(entries(options.kind)))
+        from toolkit.report.text import filled, width_of_output
+
+        of_kind, width = entries(options.kind), width_of_output()
+        longest = max(map(len, of_kind), default=0)
+        for name, text in of_kind.items():
+            print(filled(text, width, f"{name:<{longest}}  ", " " * (longest + 2)).rstrip())
     return 0
 
 
@@ -79,14 +84,6 @@ def entries(kind: str) -> Mapping[str, str]:
 def _summary(kind: str, names: list[str]) -> str:
     more = ", ..." if len(names) > _EXAMPLES else ""
     return f"{len(names):>3} {kind:<{max(map(len, KINDS))}}  {', '.join(names[:_EXAMPLES])}{more}"
-
-
-def _listing(entries: Mapping[str, str]) -> str:
-    from toolkit.report.text import filled, width_of_output
-
-    longest, width = max(map(len, entries), default=0), width_of_output()
-    lines = (filled(text, width, f"{name:<{longest}}  ", " " * (longest + 2)) for name, text in entries.items())
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def _estimator(entry: EstimatorEntry) -> str:
