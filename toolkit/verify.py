@@ -166,10 +166,10 @@ def look_ahead(watched: Watched) -> str:
     return ""
 
 
-def other_answers(first: Watched, packets: tuple[Packet, ...] = ()) -> str:
-    """Say at which frame a second run over the same packets, or others that are equal, gives another answer."""
+def other_answers(first: Watched) -> str:
+    """Say at which frame a second run over the same packets gives another answer."""
     estimator = first.build(first.setup)
-    for k, (packet, before) in enumerate(zip(packets or first.packets, first.online, strict=True)):
+    for k, (packet, before) in enumerate(zip(first.packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
             return f"a second run differs at frame {k}: {found}"
     found = difference(estimator.finish(), first.finished)
@@ -500,7 +500,11 @@ def verify(subject: EstimatorEntry, word: str, progress: Progress = SILENT) -> V
                 raised = raised or f"{sequence.name}: {_error_message(error)}"
         checks = [_runs(raised, declined)]
         if watched:
-            checks += _of_runs(watched)
+            checks += [_check(name, partial(_first, watched, broken)) for name, (broken, _) in OF_A_RUN.items()]
+            if any(next(_stated(one), None) for one in watched):
+                checks.append(_check(_COVARIANCE, partial(_first, watched, unsound_covariance)))
+            else:
+                checks.append(_checked(_COVARIANCE, "not applicable", _NO_COVARIANCE))
             progress.advance(len(SCENARIOS), steps, "NEES")
             checks.append(_consistent(subject.name, build, next(s for s in SCENARIOS if s.name not in declined)))
             progress.advance(len(SCENARIOS) + 1, steps, "threads")
@@ -525,15 +529,6 @@ def _runs(raised: str, declined: Mapping[str, str]) -> CheckRecord:
     if raised or len(declined) == len(SCENARIOS):
         return _checked(_RUNS, "failed", raised or f"it declines every recording: {whys}")
     return _checked(_RUNS, "passed", f"not applicable to {', '.join(declined)}: {whys}" if declined else "")
-
-
-def _of_runs(watched: list[Watched]) -> Iterator[CheckRecord]:
-    for name, (broken, _) in OF_A_RUN.items():
-        yield _check(name, partial(_first, watched, broken))
-    if any(next(_stated(one), None) for one in watched):
-        yield _check(_COVARIANCE, lambda: _first(watched, unsound_covariance))
-    else:
-        yield _checked(_COVARIANCE, "not applicable", _NO_COVARIANCE)
 
 
 def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
