@@ -14,7 +14,6 @@ optimization to iterated extended Kalman filtering on Lie groups"). A correction
 its cost under the prediction is ``delta . pull``, and the covariance P is never inverted.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -146,14 +145,9 @@ def most_probable(measurement: Measurement) -> IterationResult:
         step = measurement.step(now)
         if step.length < NEGLIGIBLE_STEP:
             return IterationResult(measurement.after(now.pull + step.pull), converged=True)
-        lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
+        shortened = (measurement.after(now.pull + 0.5**halvings * step.pull) for halvings in range(MOST_HALVINGS + 1))
+        lower = next((then for then in shortened if then.cost < now.cost), None)
         if lower is None:
             return IterationResult(now, converged=False)
         now = lower
     return IterationResult(now, converged=False)
-
-
-def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:
-    """Yield the iterate after the full step, after half of it, after a quarter, and so on."""
-    for halvings in range(MOST_HALVINGS + 1):
-        yield measurement.after(now.pull + 0.5**halvings * pull)

@@ -28,7 +28,7 @@ from filters.kalman.tracks import (
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
-from toolkit.measurements import NS_PER_S, Packet, StereoFrame
+from toolkit.measurements import NS_PER_S, Packet
 from toolkit.models.gating import FrameGate
 from toolkit.models.state import Belief
 
@@ -80,10 +80,15 @@ class Msckf:
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
         forget_lost(self._joint, frame, self._memory)
         correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
-        self._tracks.add_frame(self._without_landmarks(frame))
+        if len(self._joint.landmark_ids):
+            frame = frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
+        self._tracks.add_frame(frame)
         leaving = bisect_left(self._clone_t_ns, frame.t_ns - self._lag_ns)
         self._correct_by_tracks(leaving, gate)
-        self._forget_oldest(leaving)
+        if leaving:
+            self._joint.forget_clones(leaving)
+            self._tracks.drop_oldest(leaving)
+            del self._clone_t_ns[:leaving]
         gate_in_view = FrameGate(outliers.gate_probability, outliers.joint_huber)
         now = given_tracks_in_view(self._joint, self._window(), self._tracks, self._rig, gate_in_view)
         return now.estimate(frame.t_ns, **gate.info())
@@ -96,12 +101,6 @@ class Msckf:
     def _window(self) -> WindowPoses:
         columns = self._joint.clone_columns
         return WindowPoses(self._joint.clones, self._at.clones(self._joint), self._joint.cov[columns, columns])
-
-    def _without_landmarks(self, frame: StereoFrame) -> StereoFrame:
-        """Return the frame without the sightings of landmarks in the state."""
-        if not len(self._joint.landmark_ids):
-            return frame
-        return frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
 
     def _correct_by_tracks(self, leaving: int, gate: FrameGate) -> None:
         """Correct by the tracks that have ended, and by those seen from the oldest poses, which leave the window now.
@@ -132,10 +131,3 @@ class Msckf:
         first = int(np.argmax(found.seen.any(axis=0)))
         taken = found.halves[:, :, 6 * first :].reshape(-1, found.halves.shape[2] - 6 * first)
         self._joint.inform(found.blocks[first:], taken, found.vector[6 * first :])
-
-    def _forget_oldest(self, count: int) -> None:
-        """Marginalise the oldest poses."""
-        if count:
-            self._joint.forget_clones(count)
-            self._tracks.drop_oldest(count)
-            del self._clone_t_ns[:count]

@@ -10,7 +10,6 @@ section 4).
 
 from copy import copy
 from dataclasses import replace
-from itertools import accumulate
 from typing import Self
 
 import numpy as np
@@ -100,7 +99,7 @@ class JointBelief:
         """Marginalise landmarks (L,)."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.landmark_columns] = np.repeat(~which, 3)
-        self._cov = _of_slices(self._cov, _true_ranges(kept))
+        self._cov = self._cov.compress(kept, axis=0).compress(kept, axis=1)
         self.landmark_ids = self.landmark_ids[~which]
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
@@ -328,22 +327,4 @@ def root_with_information(
 
 def _symmetric(cov: Array) -> Array:
     result: Array = 0.5 * (cov + cov.T)
-    return result
-
-
-def _true_ranges(kept: BoolArray) -> list[slice]:
-    """Return the contiguous ranges in which a mask (n,) is True."""
-    padded = np.zeros(kept.size + 2, dtype=bool)
-    padded[1:-1] = kept
-    edges = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
-    return [slice(begin, end) for begin, end in edges.tolist()]
-
-
-def _of_slices(cov: Array, stretches: list[slice]) -> Array:
-    """Return a matrix' rows and columns in some ranges, in their order; for few ranges faster than an index array."""
-    ends = list(accumulate(stretch.stop - stretch.start for stretch in stretches))
-    result, begin = np.empty((ends[-1], ends[-1])), 0
-    for stretch, end in zip(stretches, ends, strict=True):
-        np.concatenate([cov[stretch, other] for other in stretches], axis=1, out=result[begin:end])
-        begin = end
     return result
