@@ -58,7 +58,17 @@ def card_lines(card: Card) -> Iterator[str]:
         f"{card.a_frame:.0f} visible tracks a frame, seen in {middle:.0f} frames in the median ({few:.0f} to "
         f"{many:.0f} in 80 %), at a depth of {card.depth_m[1]:.1f} m ({card.depth_m[0]:.1f} to {card.depth_m[2]:.1f} m)"
     )
-    yield _noise(card)
+    weight, lags = card.weight, "/".join(f"{one:.2f}" for one in card.correlation[0])
+    if card.correlated:
+        yield (
+            f"sightings: {tracks_measured(weight)}; in column, disparity and row {lags}, with {weight.variance:.2g} "
+            "times the stated variance (noise.track_weight)"
+        )
+    else:
+        yield (
+            f"errors of a track are white (correlation from frame to frame {lags} in column, disparity and row): what "
+            "every estimator assumes, so that a smoother, which uses more data, should be the most accurate"
+        )
     if middle < _FEW_FRAMES:
         yield (
             f"tracks are short: most poses share few points with any but the next, and a smoother gains "
@@ -73,23 +83,6 @@ def card_lines(card: Card) -> Iterator[str]:
             f"{card.blind_intervals} of {card.intervals} intervals have no common track: there every estimator depends "
             "on the measured motion alone, and no smoother corrects its errors"
         )
-    yield from _scale(card)
-
-
-def _noise(card: Card) -> str:
-    weight, lags = card.weight, "/".join(f"{one:.2f}" for one in card.correlation[0])
-    if not card.correlated:
-        return (
-            f"errors of a track are white (correlation from frame to frame {lags} in column, disparity and row): what "
-            "every estimator assumes, so that a smoother, which uses more data, should be the most accurate"
-        )
-    return (
-        f"sightings: {tracks_measured(weight)}; in column, disparity and row {lags}, with {weight.variance:.2g} times "
-        "the stated variance (noise.track_weight)"
-    )
-
-
-def _scale(card: Card) -> Iterator[str]:
     if card.scale is None:
         return
     off, error = card.scale.value - 1.0, card.scale.error

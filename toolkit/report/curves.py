@@ -42,7 +42,6 @@ from toolkit.registry import defaults, discover, ladder
 from toolkit.sequence import Sequence, Truth
 
 T = TypeVar("T")
-Series = TypeVar("Series")
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
 Numbers = tuple[float | None, ...]
 # How many colours there are; a look of a higher number has the colours over again, in other dashes.
@@ -127,14 +126,19 @@ class NisSeries(Columns, frozen=True, kw_only=True):
 
 
 def available(compute: Callable[[Evaluation], T], run: Run, output: Output, sequence: Sequence) -> T | None:
-    """Return what is computed of an output, None where it is unavailable; a diverged run may overflow meanwhile."""
+    found = computed_or_reason(compute, run, output, sequence)
+    return None if isinstance(found, str) else found
+
+
+def computed_or_reason(compute: Callable[[Evaluation], T], run: Run, output: Output, sequence: Sequence) -> T | str:
+    """Return what is computed of an output, or why it is unavailable; a diverged run may overflow meanwhile."""
     if run.trajectory(output) is None:
-        return None
+        return "the run gave no trajectory"
     try:
         with np.errstate(all="ignore"):
             return compute(Evaluation(run, output, sequence))
-    except Unavailable:
-        return None
+    except Unavailable as reason:
+        return str(reason)
 
 
 class ReferenceEstimate(NamedTuple):
@@ -298,17 +302,6 @@ def _in_world_axes(
     columns = {name: numbers(error[:, i]) for i, name in enumerate(COMPONENTS)}
     stated = {f"sigma_{name}": numbers(sigma[:, i]) for i, name in enumerate(COMPONENTS)}
     return ComponentSeries(t_s=t_s, **columns, **stated)
-
-
-def series_or_reason(series: Callable[[Evaluation], Series], row: Row, sequence: Sequence) -> Series | str:
-    """Return what is computed of an output, or why it is unavailable; a diverged run may overflow meanwhile."""
-    if row.run.trajectory(row.output) is None:
-        return "the run gave no trajectory"
-    try:
-        with np.errstate(all="ignore"):
-            return series(Evaluation(row.run, row.output, sequence))
-    except Unavailable as reason:
-        return str(reason)
 
 
 def nees_series(evaluation: Evaluation) -> NeesSeries:

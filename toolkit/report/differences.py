@@ -73,7 +73,10 @@ def differences(before: Files, after: Files) -> DiffRecord:
     lines = [_lines(files) for files in (before, after)]
     twice = repeated(before) & repeated(after)
     both = [key for key in lines[0] if key in lines[1] and not (key[0] in twice and key[1] == "final")]
-    paired = _reads_the_same(before, after)
+    hashes = [_hashes(files) for files in (before, after)]
+    shared = hashes[0].keys() & hashes[1].keys()
+    # Runs of one seed are paired where both sides read the same recording under each common one.
+    paired = bool(shared) and all(hashes[0][seed] == hashes[1][seed] for seed in shared)
     values = [(key, metric) for key in both for metric in known_metrics()]
     raw = [_tested(lines[0][key], lines[1][key], metric, paired=paired) for key, metric in values]
     corrected = iter(holm(np.array([p for p in raw if p is not None])).tolist())
@@ -158,13 +161,6 @@ def _lines(files: Files) -> dict[tuple[str, str], _Line]:
         (run.estimator, run.output): _Line(by_seed(run.status), {k: by_seed(one) for k, one in run.metrics.items()})
         for run in files.scores.runs
     }
-
-
-def _reads_the_same(before: Files, after: Files) -> bool:
-    """Say whether both sides read the same recording under each common seed; otherwise runs are not paired."""
-    one, two = _hashes(before), _hashes(after)
-    shared = one.keys() & two.keys()
-    return bool(shared) and all(one[seed] == two[seed] for seed in shared)
 
 
 def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> float | None:

@@ -14,15 +14,7 @@ from msgspec.structs import replace
 
 from toolkit.errors import DataError
 from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE, OF_THE_BODY
-from toolkit.evaluation.standings import (
-    EvaluatedSystems,
-    OverRuns,
-    PairedRecord,
-    Quartiles,
-    StandingRecord,
-    evaluation_document,
-    read_evaluation,
-)
+from toolkit.evaluation.standings import EvaluatedSystems, OverRuns, PairedRecord, evaluation_document, read_evaluation
 from toolkit.experiment.statistics import mean_interval
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory, with_folders
@@ -87,10 +79,11 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     several, metrics = len(evaluation.sequences) > 1, shown_metrics(evaluation, columns)
     heads: list[tuple[str, ...]] = [("system", "", ""), ("runs", "ok", "")]
     heads += [("mean", "rank", ""), ("first", f"of {len(evaluation.ranked_sequences)}", "")] if several else []
-    found = {
-        metric: [_quartiles_of(evaluation, one, metric, several=several) for one in evaluation.leaderboard]
-        for metric in (evaluation.ranked_by, *metrics)
-    }
+    whole = [
+        standing if several else evaluation.cells[standing.estimator, evaluation.sequences[0]]
+        for standing in evaluation.leaderboard
+    ]
+    found = {metric: [one.metrics.get(metric.key) for one in whole] for metric in (evaluation.ranked_by, *metrics)}
     medians = {
         metric: [None if one is None else one.median for one in quartiles] for metric, quartiles in found.items()
     }
@@ -111,14 +104,6 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     before = len(heads) - len(metrics)
     best = {(i, before + j) for j, metric in enumerate(metrics) for i in best_of(medians[metric], metric)}
     return Table(tuple(heads), tuple(rows), labels=1, best=frozenset(best))
-
-
-def _quartiles_of(
-    evaluation: EvaluatedSystems, standing: StandingRecord, metric: Metric, *, several: bool
-) -> Quartiles | None:
-    if several:
-        return standing.metrics.get(metric.key)
-    return evaluation.cells[standing.estimator, evaluation.sequences[0]].metrics.get(metric.key)
 
 
 def best_of(medians: list[float | None], metric: Metric) -> set[int]:

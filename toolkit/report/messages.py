@@ -226,14 +226,11 @@ def consistency_lines(comparison: Comparison) -> Iterator[str]:
             above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
             how = _MARK.get(row.mark, "over the whole run no more than errors that last from frame to frame explain")
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
-        yield verdict + _stated_over_true(row)
-
-
-def _stated_over_true(row: Row) -> str:
-    """Say how much of its true variance an output states, the bound and its excess over it, where both are known."""
-    true = [None if excess is None else 1.0 + excess for excess in row.good_values("excess_variance")]
-    found = ratio_of_means(row.good_values("claimed_variance"), true)
-    return "" if found is None else f"; it states {found.mean:.2f} ± {found.error:.2f} of its true variance"
+        # The true variance is the bound and its excess over it, where both are known.
+        true = [None if excess is None else 1.0 + excess for excess in row.good_values("excess_variance")]
+        found = ratio_of_means(row.good_values("claimed_variance"), true)
+        of_true = "" if found is None else f"; it states {found.mean:.2f} ± {found.error:.2f} of its true variance"
+        yield verdict + of_true
 
 
 def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
@@ -319,7 +316,10 @@ def verdict(comparison: Comparison) -> str:
     by_question = {contest.question: contest for contest in comparison.contests}
     contest = next((by_question[about] for about in _VERDICT_ABOUT if about in by_question), None)
     if contest is None:
-        return _of_few(comparison)
+        ended = [row.estimator for row in comparison.lines if row.answered and row.counts["ok"] == len(row.outcomes)]
+        if not ended:
+            return "No run ended well: there is nothing to compare."
+        return f"Nothing to compare: only {listed(ended)} can be scored here. {_trust(comparison)}".strip()
     runs = f"{len(comparison.seeds)} seeds" if comparison.over_seeds else "one run"
     best = contest_text(contest_record(contest), runs, contest.rows[0].mark)
     limits = "Withheld tracks show errors over a few frames, not the distance from the true path."
@@ -328,13 +328,6 @@ def verdict(comparison: Comparison) -> str:
         *(_trust(comparison), _cost(contest), why_sentence(contest, comparison.source, len(comparison.seeds))),
     )
     return " ".join(filter(None, sentences))
-
-
-def _of_few(comparison: Comparison) -> str:
-    ended = [row.estimator for row in comparison.lines if row.answered and row.counts["ok"] == len(row.outcomes)]
-    if not ended:
-        return "No run ended well: there is nothing to compare."
-    return f"Nothing to compare: only {listed(ended)} can be scored here. {_trust(comparison)}".strip()
 
 
 def contest_record(contest: Contest) -> ContestRecord:

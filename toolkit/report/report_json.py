@@ -30,12 +30,12 @@ from toolkit.report.curves import (
     alignment_text,
     check_lengths,
     components,
+    computed_or_reason,
     error_curves,
     nees_series,
     nis_series,
     onto_truth,
     seconds,
-    series_or_reason,
     shown_output,
     truth_during,
 )
@@ -202,7 +202,17 @@ def report_document(comparison: Comparison) -> Report:
             for run in comparison.runs
             if len(run.landmarks)
         ),
-        words=_messages(comparison),
+        words=Messages(
+            sequence=f"{sequence_line(comparison.sequence)}; {noise_line(comparison)}",
+            verdict=verdict(comparison),
+            notes=tuple(note_lines(comparison)),
+            remarks=tuple(remark_lines(comparison)),
+            start=comparison.prior.source,
+            audit=tuple(of_attributes(AuditMessage, one, outcome=outcome(one)) for one in comparison.findings),
+            undecided=dict(comparison.undecided),
+            facts=comparison.sequence.provenance.facts,
+            changes=dict(comparison.changes),
+        ),
         card=UNSET if comparison.card is None else card_record(comparison.card),
         contests=tuple(contest_record(one) for one in comparison.contests),
     )
@@ -224,22 +234,6 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
     )
 
 
-def _messages(comparison: Comparison) -> Messages:
-    return Messages(
-        sequence=f"{sequence_line(comparison.sequence)}; {noise_line(comparison)}",
-        verdict=verdict(comparison),
-        notes=tuple(note_lines(comparison)),
-        remarks=tuple(remark_lines(comparison)),
-        start=comparison.prior.source,
-        audit=tuple(
-            AuditMessage(fault=f.fault, count=f.count, outcome=outcome(f), detail=f.detail) for f in comparison.findings
-        ),
-        undecided=dict(comparison.undecided),
-        facts=comparison.sequence.provenance.facts,
-        changes=dict(comparison.changes),
-    )
-
-
 def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnRun:
     answered = row.run.trajectory(row.output) is not None
     alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else NOT_ALIGNED
@@ -251,8 +245,8 @@ def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnR
         rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
         translation_m=_vector(alignment.translation),
         errors=errors,
-        nees=series_or_reason(nees_series, row, comparison.sequence),
-        nis=series_or_reason(nis_series, row, comparison.sequence),
+        nees=computed_or_reason(nees_series, row.run, row.output, comparison.sequence),
+        nis=computed_or_reason(nis_series, row.run, row.output, comparison.sequence),
         components=(None if row.repeats_causal else components(comparison, row)) or UNSET,
     )
 
@@ -276,16 +270,11 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
 
 def _over_seeds(group: Row) -> DrawnOverSeeds:
     nees, errors_m = group.mean_nees, group.position_m
+    known_m = None if errors_m is None else np.ma.masked_invalid(errors_m)
+    rms_m = None if known_m is None else np.sqrt((known_m * known_m).mean(axis=0))
     return DrawnOverSeeds(
         estimator=group.estimator,
         output=group.output,
         nees=None if nees is None else of_attributes(MeanNeesSeries, nees, numbers, pose=numbers(nees.mean)),
-        position_rms_m=None if errors_m is None else numbers(_rms_over_runs(errors_m)),
+        position_rms_m=None if rms_m is None else numbers(rms_m.filled(np.nan)),
     )
-
-
-def _rms_over_runs(errors: Array) -> Array:
-    """Return the root mean square (K,) over runs of errors (runs, K), NaN where no run has one."""
-    known = np.isfinite(errors)
-    total, count = np.where(known, errors, 0.0) ** 2, known.sum(axis=0)
-    return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)

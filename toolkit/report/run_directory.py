@@ -145,7 +145,9 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
     where ``target`` cannot be written or holds something else; nothing is left behind then.
     """
     with replaced_directory(target, written_by_us) as directory:
-        _take_over(comparison, target, directory)
+        kept = (OUTCOMES, *(name for outcome in comparison.outcomes for name in outcome.files))
+        for name in kept if OUTCOMES in files_of_ours(target) else ():
+            take_over(target / name, directory / name)
         for name, text in _texts(comparison):
             (directory / name).parent.mkdir(exist_ok=True)
             _write_text(directory / name, text)
@@ -165,13 +167,6 @@ def _written_figures(comparison: Comparison, folder: Path, made_by: MadeBy) -> d
     from toolkit.report.figures import drawn, save
 
     return save(drawn(comparison, made_by.choice), folder, made_by.figures)
-
-
-def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
-    """Have what is kept of the runs in a new run directory, too, before it takes the place of the old one."""
-    trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
-    for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
-        take_over(target / name, directory / name)
 
 
 def _texts(comparison: Comparison) -> Iterator[tuple[str, str]]:

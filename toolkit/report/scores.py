@@ -198,9 +198,19 @@ read_seeds = reader(Seeds, REPEAT)
 
 def metrics_document(comparison: Comparison) -> MetricsDocument:
     """Return the scores of a comparison; a value that is not finite becomes null with a note."""
+    sequence = comparison.sequence
     return MetricsDocument(
         schema="vislam.metrics/1",
-        sequence=_sequence(comparison.sequence),
+        sequence=SequenceRead(
+            name=sequence.name,
+            hash=sequence.content_hash(),
+            frames=sequence.frame_count,
+            tracks=int(np.unique(sequence.observations.track_id).size),
+            observations=len(sequence.observations),
+            duration_s=sequence.duration_s,
+            path_m=path_length_m(sequence),
+            motion=sequence.motion_kind,
+        ),
         audit=tuple(of_attributes(AuditEntry, finding) for finding in comparison.findings),
         undecided=dict(comparison.undecided),
         runs=tuple(_run(row) for row in comparison.rows),
@@ -236,19 +246,6 @@ def path_length_m(sequence: Sequence) -> float | None:
         return None
     truth = truth_during(sequence)
     return 0.0 if truth is None else float(np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
-
-
-def _sequence(sequence: Sequence) -> SequenceRead:
-    return SequenceRead(
-        name=sequence.name,
-        hash=sequence.content_hash(),
-        frames=sequence.frame_count,
-        tracks=int(np.unique(sequence.observations.track_id).size),
-        observations=len(sequence.observations),
-        duration_s=sequence.duration_s,
-        path_m=path_length_m(sequence),
-        motion=sequence.motion_kind,
-    )
 
 
 def _run(row: Row) -> ScoredRun:

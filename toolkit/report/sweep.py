@@ -125,7 +125,14 @@ def sweep_table(sweep: SweepRecord) -> Table:
     for at, effects in groupby(sweep.effects, key=lambda effect: effect.at):
         if at:
             told = ", ".join(name for one in at.items() for name in found.get(one, ()))
-            rows.append((*_named(at), told, *(in_words(effect.over_clean) for effect in effects)))
+            rows.append(
+                (
+                    ", ".join(at),
+                    ", ".join(map(shown_value, at.values())),
+                    told,
+                    *(in_words(effect.over_clean) for effect in effects),
+                )
+            )
         else:
             rows.append(("clean", "", "", *_clean_cells(metric_of(sweep), list(effects))))
     unknown = {(e.estimator, *one) for e in sweep.effects if e.over_clean is None for one in e.at.items()}
@@ -139,10 +146,6 @@ def sweep_table(sweep: SweepRecord) -> Table:
 
 def metric_of(sweep: Sweep | SweepRecord) -> Metric:
     return next(metric for metric in known_metrics() if metric.key == sweep.metric)
-
-
-def _named(at: Mapping[str, Scalar]) -> tuple[str, str]:
-    return ", ".join(at), ", ".join(map(shown_value, at.values()))
 
 
 def shown_value(value: Scalar) -> str:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
-from toolkit.report.curves import nees_series, nis_series, series_or_reason, shown_as
+from toolkit.report.curves import computed_or_reason, nees_series, nis_series, shown_as
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 
@@ -74,7 +74,7 @@ def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
     found = [
         (row, Normalised(series.t_s, np.array(series.pose, float), *series.band))
         for row in comparison.lines
-        if not isinstance(series := series_or_reason(nees_series, row, comparison.sequence), str)
+        if not isinstance(series := computed_or_reason(nees_series, row.run, row.output, comparison.sequence), str)
     ]
     if found:
         yield NamedFigure("nees_over_time", _OF_NEES, _figure(comparison, found, "pose NEES / 6"))
@@ -84,7 +84,7 @@ def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
     found = [
         (row, Normalised(series.t_s, *(np.array(one, float) for one in (series.per_dof, series.low, series.high))))
         for row in comparison.lines
-        if not isinstance(series := series_or_reason(nis_series, row, comparison.sequence), str)
+        if not isinstance(series := computed_or_reason(nis_series, row.run, row.output, comparison.sequence), str)
     ]
     if found:
         yield NamedFigure("nis_over_time", _OF_NIS, _figure(comparison, found, "NIS / expected"))

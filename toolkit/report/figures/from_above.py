@@ -32,17 +32,6 @@ def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     return above
 
 
-def _track(comparison: Comparison, run: Run) -> Array:
-    """Return a run's final answer from above (M, 2), without poses that are not finite; nothing of no trajectory."""
-    trajectory = run.trajectory(shown_output(run))
-    return NOWHERE if trajectory is None else from_above(comparison, run, trajectory.positions)
-
-
-def _true_track(comparison: Comparison) -> Array:
-    truth = truth_during(comparison.sequence)
-    return NOWHERE if truth is None else truth.T_world_imu[:, :2, 3]
-
-
 def view_of(tracks: Sequence[Array], landmarks: Array) -> tuple[Array, Array]:
     """Return lower left and upper right (2,) of all tracks (N, 2) and of all but the farthest landmarks (M, 2)."""
     track = np.vstack([NOWHERE, *tracks])
@@ -82,7 +71,10 @@ def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title: str) -> Figure:
-    truth, tracks = _true_track(comparison), [_track(comparison, run) for run in runs]
+    during = truth_during(comparison.sequence)
+    truth = NOWHERE if during is None else during.T_world_imu[:, :2, 3]
+    answers = [(run, run.trajectory(shown_output(run))) for run in runs]
+    tracks = [NOWHERE if one is None else from_above(comparison, run, one.positions) for run, one in answers]
     # A run that diverged would squash all the others; its own figure shows where it went.
     shown = [track for track, run in zip(tracks, runs, strict=True) if run.status == "ok" or len(runs) == 1]
     landmarks = NOWHERE if mapper is None else from_above(comparison, mapper, mapper.landmarks.points_world)

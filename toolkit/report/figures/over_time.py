@@ -14,19 +14,10 @@ from msgspec.structs import asdict
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
-from toolkit.metrics.bound import AgainstBound, against_bound
+from toolkit.metrics.bound import against_bound
 from toolkit.metrics.parts.evaluation import rmse
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.curves import (
-    COMPONENTS,
-    ErrorCurves,
-    Numbers,
-    available,
-    components,
-    error_curves,
-    reference_estimate,
-    shown_as,
-)
+from toolkit.report.curves import COMPONENTS, Numbers, available, components, error_curves, reference_estimate, shown_as
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
@@ -42,11 +33,8 @@ _LEAST = 1e-3
 def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
     curves = error_curves(comparison)
-    if curves is not None:
-        yield _figure(comparison, curves)
-
-
-def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
+    if curves is None:
+        return
     figure, kind = style.new_figure(4.4), curves.kind
     position, heading = figure.subplots(2, 1, sharex=True)
     position_m = {row: _known(errors.position_m) for row, errors in curves.of_rows.items()}
@@ -58,13 +46,13 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
             axes.plot(curves.of_rows[row].t_s, sizes, linewidth=width, **stroke)
         _scale(axes, of_rows, unit)
     style.label_axes(position, f"{comparison.name}: position {kind.what}, {kind.placing}", "", "position [m]")
-    style.label_axes(heading, f"heading {kind.what}", "time [s]", "heading [deg]")
+    style.label_axes(heading, f"size of the heading {kind.what}", "time [s]", "|heading| [deg]")
     figure.align_ylabels()
     told = {row.estimator: f"{number(rmse(sizes))} m" for row, sizes in position_m.items()}
-    entries = style.entries_of(comparison, [(row.estimator, shown_as(row)) for row in curves.of_rows])
+    entries = style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row in curves.of_rows])
     style.legend_below(figure, [entry._replace(label=f"{entry.label}: {told[entry.label]}") for entry in entries])
     caption = f"Position and heading {kind.what} over time, in the legend the RMS of the position, of the final output"
-    return NamedFigure("errors_over_time", f"{caption} where there is one. {kind.caption}", figure)
+    yield NamedFigure("errors_over_time", f"{caption} where there is one. {kind.caption}", figure)
 
 
 def _known(values: Numbers) -> Array:
@@ -180,11 +168,8 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
         for row in comparison.lines
         if (one := available(against_bound, row.run, row.output, comparison.sequence)) is not None
     ]
-    if found:
-        yield _bound_figure(comparison, found)
-
-
-def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
+    if not found:
+        return
     figure = style.new_figure(4.8)
     position, rotation = figure.subplots(2, 1, sharex=True)
     of_output = {row.output: one for row, one in reversed(found)}  # the bound is that of any estimator's output
@@ -207,10 +192,10 @@ def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]])
     style.label_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     entries = [Entry.of_line(f"bound {output}", style.TRUTH_COLOUR, style.line_of(output), 2.0) for output in outputs]
-    entries += style.entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
+    entries += style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row, _ in found])
     entries += [Entry.of_line("thin: stated", style.MUTED_COLOUR, width=_STATED_WIDTH)]
     style.legend_below(figure, entries)
-    return NamedFigure("against_bound", _OF_BOUND, figure)
+    yield NamedFigure("against_bound", _OF_BOUND, figure)
 
 
 def _sigma(covs: Array, block: slice) -> Array:

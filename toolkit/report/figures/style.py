@@ -118,10 +118,10 @@ class Entry(NamedTuple):
         return cls(label, Line2D([], [], color=colour, linestyle=dashes, linewidth=width))
 
 
-def entries_of(comparison: "Comparison", drawn: Sequence[tuple[str, Output]]) -> list[Entry]:
+def entries_of(estimators: Iterable[str], drawn: Sequence[tuple[str, Output]]) -> list[Entry]:
     """Return an entry for each estimator of which outputs are drawn, with the line of the final one where it is."""
     output_of = dict(sorted(drawn, key=lambda pair: pair[1]))  # causal before final
-    strokes = {name: stroke_of(comparison.estimators, name, output_of[name]) for name, _ in drawn}
+    strokes = {name: stroke_of(estimators, name, output_of[name]) for name, _ in drawn}
     return [Entry.of_line(name, stroke["color"], stroke["linestyle"], 1.8) for name, stroke in strokes.items()]
 
 
@@ -148,7 +148,7 @@ def panels_of(
     names: Sequence[str], x_label: str = "time [s]", panel_in: float = _PANEL_IN
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure with an empty panel of some height a name, all on the same axes."""
-    columns = columns_for(len(names))
+    columns = 4 if len(names) >= _MANY else 2 if len(names) in (2, 4) else min(3, len(names))
     rows = -(-len(names) // columns)
     figure = new_figure(0.85 + panel_in * rows)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
@@ -162,12 +162,6 @@ def panels_of(
         axes.tick_params(labelbottom=True)
         axes.set_xlabel(x_label, fontsize=LABEL_PT)
     return figure, panels
-
-
-def columns_for(count: int) -> int:
-    if count >= _MANY:
-        return 4
-    return 2 if count in (2, 4) else min(3, count)
 
 
 def say(axes: Axes, text: str) -> None:

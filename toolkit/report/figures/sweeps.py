@@ -11,7 +11,7 @@ from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
 from toolkit.files.writing import plain_name
 from toolkit.report.figures import style
-from toolkit.report.figures.style import Entry, NamedFigure
+from toolkit.report.figures.style import NamedFigure
 from toolkit.report.sweep import metric_of, shown_value
 
 # Doses that span more than this factor are laid out by their logarithm.
@@ -59,16 +59,20 @@ def _word(axis: Axis) -> str:
 def _curves(sweep: Sweep, axis: Axis) -> NamedFigure:
     figure = style.new_figure(_HEIGHT_IN)
     panels, places = figure.subplots(1, 3, sharex=True), _Places(axis)
+    points = {places.clean: CLEAN, **{places.of[point[0][1]]: point for point in axis.points}}
     titles = ("error over clean", "pose NEES / 6", "withheld tracks over clean")
     for axes, title, field in zip(panels, titles, ("over_clean", "nees", "held_out"), strict=True):
         style.label_axes(axes, title, f"{axis.name.removeprefix('fault:')}{f' [{axis.unit}]' if axis.unit else ''}", "")
         axes.axhline(1.0, color=style.ZERO_COLOUR, linewidth=0.8)
-        lines = {name: _line(sweep, axis, places, name, field) for name in sweep.estimators}
+        lines: dict[str, list[tuple[float, Interval]]] = {}
+        for name in sweep.estimators:
+            effects = {at: getattr(sweep.effects[name, point], field) for at, point in sorted(points.items())}
+            lines[name] = [(at, one) for at, one in effects.items() if one is not None]
         _draw_lines(axes, lines)
         axes.set_xticks(list(places.ticks), list(places.ticks.values()), fontsize=style.TICK_PT)
     panels[0].axhline(BREAKS_AT, color=style.MUTED_COLOUR, linewidth=0.8, linestyle=":")
     style.add_title(figure, f"{sweep.grid.case.name}: {axis.name}")
-    style.legend_below(figure, _entries(sweep))
+    style.legend_below(figure, style.entries_of(sweep.estimators, [(name, "final") for name in sweep.estimators]))
     over = f"{len(sweep.grid.plan.seeds)} seeds, paired" if sweep.over_seeds else "stretches of the recording"
     caption = (
         f"{axis.name} on {sweep.grid.case.name} ({axis.meaning.rstrip('.')}): error over that of the clean recording "
@@ -76,12 +80,6 @@ def _curves(sweep: Sweep, axis: Axis) -> NamedFigure:
         f"the clean one; 95 % intervals over {over}. Crosses: runs that did not end well."
     )
     return NamedFigure(f"sweep_{plain_name(axis.name)}", caption, figure)
-
-
-def _line(sweep: Sweep, axis: Axis, places: _Places, name: str, field: str) -> list[tuple[float, Interval]]:
-    known = {places.clean: CLEAN, **{places.of[point[0][1]]: point for point in axis.points}}
-    effects = {place: getattr(sweep.effects[name, point], field) for place, point in sorted(known.items())}
-    return [(place, one) for place, one in effects.items() if one is not None]
 
 
 def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> None:
@@ -124,7 +122,7 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
         style.scale_by_decades(axes, 0.8 * errors.min(), 1.25 * errors.max())
     title = f"{sweep.grid.case.name}: error against time over {axis.name}"
     style.add_title(figure, title)
-    style.legend_below(figure, _entries(sweep))
+    style.legend_below(figure, style.entries_of(sweep.estimators, [(name, "final") for name in sweep.estimators]))
     caption = (
         f"{metric.name} against processor time over the values of {axis.name} on {sweep.grid.case.name}, means over "
         "the runs. Filled: on the Pareto front, no other is both more accurate and faster."
@@ -141,8 +139,3 @@ def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, fl
         if one.ok == one.runs and one.error and one.cpu_ms
     }
     return dict([*good.items()][: 1 if len({error for _, error in good.values()}) == 1 else None])
-
-
-def _entries(sweep: Sweep) -> list[Entry]:
-    strokes = {name: style.stroke_of(sweep.estimators, name) for name in sweep.estimators}
-    return [Entry.of_line(name, stroke["color"], stroke["linestyle"]) for name, stroke in strokes.items()]

@@ -13,7 +13,6 @@ from toolkit.errors import DataError
 from toolkit.evaluation.scoring import TruthFile, aligned_file
 from toolkit.evaluation.standings import EvaluatedSystems, RunRecord
 from toolkit.files.writing import plain_name
-from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
 from toolkit.metrics.parts.evaluation import Matched, angles_deg, changes, lengths, rmse
@@ -72,12 +71,6 @@ def _middle(evaluation: EvaluatedSystems, system: str, sequence: str) -> RunReco
     return ordered[(len(ordered) - 1) // 2][1] if ordered else None
 
 
-def _since_start(truth: TruthFile, t_ns: IntArray) -> Array:
-    """Return times (n,) s since the truth's first pose, or the numbers of poses where there are no stamps."""
-    since: Array = (t_ns - truth.t_ns[0]) / NS_PER_S
-    return since if truth.is_timed else np.arange(t_ns.size, dtype=float)
-
-
 def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     figure = style.new_figure(5.0)
     axes = figure.subplots()
@@ -99,7 +92,8 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     sizes: list[float] = []
     largest = 0.0
     for one in drawn:
-        at_s, pairs = _since_start(truth, one.matched.t_ns), one.matched
+        pairs = one.matched
+        at_s = (pairs.t_ns - truth.t_ns[0]) / NS_PER_S if truth.is_timed else np.arange(pairs.t_ns.size)
         error_m = lengths(pairs.truth[:, :3, 3] - pairs.estimate[:, :3, 3])
         grid[0].plot(at_s, error_m, color=one.colour, linewidth=1.2)
         sizes, largest = [*sizes, rmse(error_m)], max(largest, float(error_m.max()))

@@ -39,7 +39,10 @@ _TITLES = {
 
 
 def payload_of(runs: Sequence[Files]) -> Json:
-    titles = _titles(runs)
+    names = [one.scores.sequence.name for one in runs]
+    titles = [
+        f"{name} ({one.directory})" if names.count(name) > 1 else name for name, one in zip(names, runs, strict=True)
+    ]
     colours = look_numbers(run.estimator for files in runs for run in files.scores.runs)
     return {
         "title": " / ".join(titles) or "Experiments",
@@ -49,13 +52,6 @@ def payload_of(runs: Sequence[Files]) -> Json:
             _case(files, f"c{i}", title, colours) for i, (files, title) in enumerate(zip(runs, titles, strict=True))
         ],
     }
-
-
-def _titles(runs: Sequence[Files]) -> list[str]:
-    names = [one.scores.sequence.name for one in runs]
-    return [
-        name if names.count(name) == 1 else f"{name} ({one.directory})" for name, one in zip(names, runs, strict=True)
-    ]
 
 
 def _case(files: Files, case_id: str, title: str, colours: dict[str, int]) -> Json:
