@@ -15,7 +15,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
 from toolkit.report.curves import COLOURS, components, error_curves, look_numbers
-from toolkit.report.figures import FigureFormat, bands, from_above, over_time, save
+from toolkit.report.figures import FigureFormat, from_above, over_time, save
 from toolkit.report.figures.from_above import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
@@ -142,7 +142,7 @@ def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comp
 
 
 def test_the_share_in_the_band_is_the_metrics(offset: Comparison) -> None:
-    (one,) = bands.draw_nees(offset)
+    (one,) = over_time.draw_nees(offset)
     (row,) = (row for row in offset.lines if row.estimator == "offset")
     share = row.value("nees_pose_in_band_percent")
     assert share is not None

@@ -84,8 +84,25 @@ def differences(before: Files, after: Files) -> DiffRecord:
     for (key, metric), p in zip(values, raw, strict=True):
         was, is_ = (side[key].value(metric) for side in lines)
         adjusted = None if p is None else next(corrected)
-        if was is not None or is_ is not None:
-            changes.append(_metric_change(*key, metric.key, was, is_, adjusted))
+        if was is None and is_ is None:
+            continue
+        moved, change_percent = True, None
+        if was is not None and is_ is not None:
+            moved = not math.isclose(was, is_, rel_tol=_SAME, abs_tol=1e-12)
+            change_percent = 100.0 * (is_ / was - 1.0) if was else None
+        changes.append(
+            MetricChangeRecord(
+                estimator=key[0],
+                output=key[1],
+                metric=metric.key,
+                before=was,
+                after=is_,
+                change_percent=change_percent,
+                moved=moved,
+                p=adjusted,
+                beyond_chance=None if adjusted is None else adjusted <= FALSE_ALARM_RATE,
+            )
+        )
     ends = tuple(_ends(*lines))
     manifests = [to_builtins(files.manifest) for files in (before, after)]
     settings, environment, data = (
@@ -103,26 +120,6 @@ def differences(before: Files, after: Files) -> DiffRecord:
         data=data,
         ends=ends,
         metrics=tuple(changes),
-    )
-
-
-def _metric_change(
-    estimator: str, output: str, metric: str, before: float | None, after: float | None, p: float | None
-) -> MetricChangeRecord:
-    moved, change_percent = before is not after, None
-    if before is not None and after is not None:
-        moved = not math.isclose(before, after, rel_tol=_SAME, abs_tol=1e-12)
-        change_percent = 100.0 * (after / before - 1.0) if before else None
-    return MetricChangeRecord(
-        estimator=estimator,
-        output=output,
-        metric=metric,
-        before=before,
-        after=after,
-        change_percent=change_percent,
-        moved=moved,
-        p=p,
-        beyond_chance=None if p is None else p <= FALSE_ALARM_RATE,
     )
 
 
@@ -227,7 +224,9 @@ def diff_text(found: DiffRecord, columns: tuple[Metric, ...] = (), width: Width 
         ("versions and machine", found.environment),
         ("how runs ended", found.ends),
     ):
-        lines += _section(title, changes)
+        rows = tuple((one.name, _short(one.before), _short(one.after)) for one in changes)
+        table = Table((("",), ("before",), ("after",)), rows, labels=3)
+        lines += [title, "", as_text(table), ""] if rows else [f"{title}: the same", ""]
     shown = columns or tuple(m for m in known_metrics() if m.table == "always" or m.over_seeds)
     keys = {metric.key: metric for metric in shown}
     moved = [one for one in found.metrics if one.moved and one.metric in keys]
@@ -235,13 +234,6 @@ def diff_text(found: DiffRecord, columns: tuple[Metric, ...] = (), width: Width 
         lines += ["metrics", "", as_text(_table(moved, keys)), ""]
     lines += [filled(line, width) for line in _summary_lines(found, len(moved), len(shown))]
     return "\n".join(lines)
-
-
-def _section(title: str, changes: tuple[ChangeRecord, ...]) -> list[str]:
-    if not changes:
-        return [f"{title}: the same", ""]
-    rows = tuple((one.name, _short(one.before), _short(one.after)) for one in changes)
-    return [title, "", as_text(Table((("",), ("before",), ("after",)), rows, labels=3)), ""]
 
 
 def _short(text: str) -> str:

@@ -223,23 +223,20 @@ def gate_junit(check: Check) -> str:
     root = ElementTree.Element("testsuites", _counts(check.verdicts), name="accuracy gate")
     root.set("time", f"{check.seconds:.3f}")
     for sequence, verdicts in groupby(check.verdicts, key=lambda verdict: verdict.sequence):
-        _add_suite(root, sequence, tuple(verdicts))
+        of_suite = tuple(verdicts)
+        suite = ElementTree.SubElement(root, "testsuite", _counts(of_suite), name=printable(sequence))
+        for verdict in of_suite:
+            who = printable(".".join(filter(None, (sequence, verdict.estimator, verdict.output))))
+            case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
+            cells = zip(_NUMBERS, _row(verdict)[len(_LABELS) :], strict=True)
+            numbers = "\n".join(f"{name} {cell} {unit}".rstrip() for (name, _, unit), cell in cells if cell != MISSING)
+            message = printable(f"{about(verdict)}: {verdict.words}") if verdict.words else ""
+            if verdict.fails:
+                ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = numbers
+            elif message:
+                ElementTree.SubElement(case, "system-out").text = f"{message}\n{numbers}"
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _add_suite(root: ElementTree.Element, sequence: str, verdicts: tuple[Verdict, ...]) -> None:
-    suite = ElementTree.SubElement(root, "testsuite", _counts(verdicts), name=printable(sequence))
-    for verdict in verdicts:
-        who = printable(".".join(filter(None, (sequence, verdict.estimator, verdict.output))))
-        case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
-        cells = zip(_NUMBERS, _row(verdict)[len(_LABELS) :], strict=True)
-        numbers = "\n".join(f"{name} {cell} {unit}".rstrip() for (name, _, unit), cell in cells if cell != MISSING)
-        message = printable(f"{about(verdict)}: {verdict.words}") if verdict.words else ""
-        if verdict.fails:
-            ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = numbers
-        elif message:
-            ElementTree.SubElement(case, "system-out").text = f"{message}\n{numbers}"
 
 
 def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:

@@ -20,7 +20,6 @@ from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near
 from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.statistics import ratio_of_means
-from toolkit.experiment.units import Scored
 from toolkit.files.documents import rounded
 from toolkit.metrics import is_on_request, metrics_called, unavailable
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
@@ -178,7 +177,9 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
 
 def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
     for row in comparison.lines:
-        harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
+        given = [(o.seed, o.outputs[row.output].scores) for o in row.outcomes if row.output in o.outputs]
+        valued = [(seed, scores.notes) for seed, scores in given if scores.values.get(RATIO) is not None]
+        harmed = [(seed, notes[RATIO]) for seed, notes in valued if notes.get(RATIO)]
         if harmed and comparison.over_seeds:
             seeds = _seeds(seed for seed, _ in harmed)
             yield f"{_name_of(row)} explains withheld tracks worse than dead reckoning under {seeds}"
@@ -196,12 +197,6 @@ def _far_from_motion(comparison: Comparison) -> Iterator[str]:
             f"{_name_of(worst.row)}{more} and the measured motion disagree, {apart}: look for slip, moving objects or "
             "a wrong calibration"
         )
-
-
-def _remark_on(key: str, scored: Scored | None) -> str:
-    if scored is None or scored.scores.values.get(key) is None:
-        return ""
-    return scored.scores.notes.get(key, "")
 
 
 def _name_of(row: Row) -> str:

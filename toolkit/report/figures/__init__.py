@@ -1,6 +1,6 @@
 """The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
-Reading order: style -> over_time, bands, from_above; the numbers are those of report.curves. sweeps has
+Reading order: style -> over_time, from_above; the numbers are those of report.curves. sweeps has
 the figures of a sweep, waterfall that of an explanation, trajectories those of trajectory files.
 """
 
@@ -31,18 +31,18 @@ FigureChoice = Literal["few", "all", "none"]
 def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[NamedFigure]:
     """Draw the few most important figures, or all that the comparison has data for, each when it is reached."""
     # With GTSAM, which figures of trajectory files do without.
-    from toolkit.report.figures import bands, from_above, over_time
+    from toolkit.report.figures import from_above, over_time
 
     # Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
     few = (
         from_above.draw_all,
         over_time.draw_errors,
         over_time.draw_telling_components,
-        bands.draw_nees,
+        over_time.draw_nees,
         over_time.draw_bound,
     )
-    more = (bands.draw_nis, over_time.draw_other_components, from_above.draw_each)
-    drawings = (bands.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
+    more = (over_time.draw_nis, over_time.draw_other_components, from_above.draw_each)
+    drawings = (over_time.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
     if choice == "none":
         drawings = ()
     return (literal(figure) for drawing in drawings for figure in drawing(comparison))

@@ -18,7 +18,7 @@ from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import ComponentSeries, NeesSeries, look_numbers
 from toolkit.report.messages import ContestRecord, contest_text
-from toolkit.report.report_json import DrawnMap, DrawnOverSeeds, DrawnRun
+from toolkit.report.report_json import DrawnMap, DrawnRun
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles, repeated
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
 from toolkit.report.text import unit_of
@@ -197,9 +197,9 @@ def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> l
 
 def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     rows: list[Json] = []
-    twice = repeated(files)
+    twice, t_s = repeated(files), files.report.t_s
     for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
-        ok, seeds = run.counts["ok"], len(run.status)
+        ok, seeds, nees, errors_m = run.counts["ok"], len(run.status), drawn.nees, drawn.position_rms_m
         if run.estimator in twice and run.output == "final":
             continue
         rows.append(
@@ -213,18 +213,11 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
                 "spreads": {key: {"std": metric.std, "n": metric.n} for key, metric in run.metrics.items()},
                 "values": {key: metric.values for key, metric in run.metrics.items()},
                 "statuses": run.status,
-                **_series(drawn, files.report.t_s),
+                "nees": None if nees is None else thinned({"t_s": t_s, **asdict(nees)}, "pose"),
+                "errors": None if errors_m is None else thinned({"t_s": t_s, "position_m": errors_m}, "position_m"),
             }
         )
     return rows
-
-
-def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
-    nees, errors_m = drawn.nees, drawn.position_rms_m
-    return {
-        "nees": None if nees is None else thinned({"t_s": t_s, **asdict(nees)}, "pose"),
-        "errors": None if errors_m is None else thinned({"t_s": t_s, "position_m": errors_m}, "position_m"),
-    }
 
 
 def highlights(contests: Sequence[ContestRecord], rows: Sequence[Json], runs: str) -> list[dict[str, str | None]]:
