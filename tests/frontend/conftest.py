@@ -129,13 +129,6 @@ def _in_this_process(one_process: None) -> None:
     """Start no process: a folder that is refused needs none."""
 
 
-def write_images(folder: Path, images: list[Image], names: list[str]) -> None:
-    """Write images as PNG."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for image, name in zip(images, names, strict=True):
-        cv2.imwrite(str(folder / name), image)
-
-
 def camera_yaml(camera: Camera, T_body_sensor: Array) -> str:
     """Return the sensor.yaml of a camera."""
     data = ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel())
@@ -153,11 +146,8 @@ def imu_text(frames: int) -> str:
     columns = ",".join([f"w_RS_S_{a}" for a in "xyz"] + [f"a_RS_S_{a}" for a in "xyz"])
     stamps = START_NS - PERIOD_NS + 5_000_000 * np.arange(10 * (frames + 2))
     rng = np.random.default_rng(7)
-    gyro, accel = (
-        rng.normal(0.0, 0.002, (stamps.size, 3)),
-        rng.normal(0.0, 0.03, (stamps.size, 3)) + np.array([0.0, 0.0, 9.81]),
-    )
-    rows = zip(stamps.tolist(), np.hstack([gyro, accel]).tolist(), strict=True)
+    gyro, accel = (rng.normal(0.0, sigma, (stamps.size, 3)) for sigma in (0.002, 0.03))
+    rows = zip(stamps.tolist(), np.hstack([gyro, accel + np.array([0.0, 0.0, 9.81])]).tolist(), strict=True)
     return f"#timestamp [ns],{columns}\n" + "".join(f"{t},{','.join(f'{x:.9g}' for x in row)}\n" for t, row in rows)
 
 
@@ -175,7 +165,9 @@ def asl_template(raw: dict[str, list[Pair]], tmp_path_factory: pytest.TempPathFa
     names = [f"{t}.png" for t in stamps]
     T_imu_right = T_IMU_LEFT @ np.linalg.inv(T_RIGHT_LEFT)
     for side, (name, T) in enumerate((("cam0", T_IMU_LEFT), ("cam1", T_imu_right))):
-        write_images(root / "mav0" / name / "data", [pair[side] for pair in raw["radtan"]], names)
+        (root / "mav0" / name / "data").mkdir(parents=True)
+        for pair, file in zip(raw["radtan"], names, strict=True):
+            cv2.imwrite(str(root / "mav0" / name / "data" / file), pair[side])
         rows = "".join(f"{t},{file}\n" for t, file in zip(stamps, names, strict=True))
         (root / "mav0" / name / "data.csv").write_text("#timestamp [ns],filename\n" + rows)
         (root / "mav0" / name / "sensor.yaml").write_text(camera_yaml(RADTAN, T))

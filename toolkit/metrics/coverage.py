@@ -29,12 +29,9 @@ METRICS = (
 
 
 def score(evaluation: Evaluation) -> Scores:
-    return evaluate(
-        {"coverage_percent": lambda: _coverage_percent(evaluation), "pairs": lambda: len(evaluation.matched)}
-    )
+    def coverage_percent() -> float:
+        if not evaluation.counted_frames.any():
+            raise Unavailable("no frame lies in the time range of the ground truth")
+        return 100.0 * float(np.mean(evaluation.has_pose[evaluation.counted_frames]))
 
-
-def _coverage_percent(evaluation: Evaluation) -> float:
-    if not evaluation.counted_frames.any():
-        raise Unavailable("no frame lies in the time range of the ground truth")
-    return 100.0 * float(np.mean(evaluation.has_pose[evaluation.counted_frames]))
+    return evaluate({"coverage_percent": coverage_percent, "pairs": lambda: len(evaluation.matched)})

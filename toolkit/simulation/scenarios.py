@@ -67,9 +67,8 @@ def noise_free(scenario: Scenario) -> Scenario:
     Exact IMU samples are instantaneous, so their integral is exact only in the limit: the error of the midpoint rule is
     proportional to the square of the sample interval.
     """
-    exact = replace(
-        scenario, noise_scale=0.0, slip_share=0.0, camera=replace(scenario.camera, step_px=0.0, outlier_rate=0.0)
-    )
+    camera = replace(scenario.camera, step_px=0.0, outlier_rate=0.0)
+    exact = replace(scenario, noise_scale=0.0, slip_share=0.0, camera=camera)
     return replace(exact, motion=replace(exact.motion, rate_hz=1000.0)) if isinstance(exact.motion, Imu) else exact
 
 
@@ -86,10 +85,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
     # The number by which a name enters the seeds is 0 for drive, whose draws depend on the seed alone.
     number = crc32(scenario.name.encode()) ^ crc32(b"drive")
     streams = np.random.SeedSequence((seed, number)).spawn(7)
-    prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng, world_rng, slips_rng = map(
-        np.random.default_rng, streams
-    )
-    track_rngs = [tracks_rng, pixels_rng, outliers_rng, slips_rng]
+    prior_rng, motion_rng, *track_rngs, world_rng, slips_rng = map(np.random.default_rng, streams)
     parts = scenario.scene, scenario.duration_s, scenario.rig, scenario.camera
     view = _view(*parts, world_rng) if scenario.varied else _view_of_all_seeds(*parts)
     frames_t_ns, motion = view.frames_t_ns, view.motion
@@ -100,7 +96,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
         rig=scenario.rig,
         noise=scenario.motion.noise,
         frames_t_ns=frames_t_ns,
-        observations=_observe(scenario, view, track_rngs),
+        observations=_observe(scenario, view, [*track_rngs, slips_rng]),
         motion=measured.samples,
         provenance=_provenance(scenario, seed),
         prior=_prior(scenario, motion, prior_rng),

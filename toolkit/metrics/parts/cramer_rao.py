@@ -317,6 +317,5 @@ def _final(problem: _Problem) -> Efficient:
         linear.push_back(frame)
     covs = state_covs(linear, problem.model, np.stack([state.T_world_imu for state in problem.states]))
     moved = problem.values.retract(linear.optimize())
-    return Efficient(
-        problem.prior.layout, covs, np.array([problem.error(k, moved) for k in range(len(problem.states))])
-    )
+    errors = [problem.error(k, moved) for k in range(len(problem.states))]
+    return Efficient(problem.prior.layout, covs, np.array(errors))
