@@ -285,7 +285,7 @@ def test_the_answer_in_view_is_the_dense_update_by_all_sightings_that_count(flig
     answer = given_tracks_in_view(joint, window, tracks, rig, gate)
     usable = ~np.isnan(tracks.points[:, 0])
     assert 25 < usable.sum() < TRACKS and not usable[7]
-    d, rows = joint.core.layout.size, []
+    rows = []
     for f in np.flatnonzero(usable):
         nis = np.array([nis_of_newest(tracks.uvs_px[f], before[f], points[f], window, rig)])
         dof = 2 if np.isnan(tracks.uvs_px[f, -1, 1]) else 3
@@ -296,8 +296,24 @@ def test_the_answer_in_view_is_the_dense_update_by_all_sightings_that_count(flig
     found = tracks.weights[usable, -1]
     assert (found == 0.0).any() == (probability is not None)
     assert ((found > 0.0) & (found < 1.0)).any() == (huber is not None)
-    r, H = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    gain = joint.cov[:d, d:] @ H.T @ np.linalg.inv(H @ window.cov @ H.T + np.eye(len(r)))
+    assert_dense_update(joint, answer, *(np.concatenate(parts) for parts in zip(*rows, strict=True)))
+
+
+def test_a_single_track_in_view_is_used_as_many_are(flight):
+    rig, joint, window = flight
+    tracks = tracks_in(rig, window, left_only=0.0)
+    tracks.seen[1:, -1] = False
+    point = tracks.points[0].copy()
+    answer = given_tracks_in_view(joint, window, tracks, rig, FrameGate(None))
+    assert_dense_update(
+        joint, answer, *without_landmark(*rows_of(tracks.uvs_px[0], tracks.weights[0], point, window, rig))
+    )
+
+
+def assert_dense_update(joint, answer, r, H):
+    """Assert that an answer is the belief's core after the Kalman update by residuals r (m,) of the clones."""
+    d = joint.core.layout.size
+    gain = joint.cov[:d, d:] @ H.T @ np.linalg.inv(H @ joint.cov[d:, d:] @ H.T + np.eye(len(r)))
     cov, sigmas = joint.core.cov - gain @ H @ joint.cov[d:, :d], np.sqrt(np.diag(answer.cov))
     assert answer.cov / np.outer(sigmas, sigmas) == pytest.approx(cov / np.outer(sigmas, sigmas), abs=1e-6)
     assert joint.core.error_to(answer) / sigmas == pytest.approx(gain @ r / sigmas, abs=1e-5)
