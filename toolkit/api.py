@@ -198,9 +198,14 @@ def _planned(source: Source, estimators: Names | None, **options: Any) -> tuple[
     given = {key: value for key, value in options.items() if key not in ("own", "settings")}
     given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
     asked = record_of(_Asked, _plain({key: value for key, value in given.items() if value is not None}))
+    settings = options.get("settings", DEFAULTS)
+    if not isinstance(settings, Settings | Mapping):
+        raise SettingsError(f"settings is {type_of(settings)}; give nested values, as {{'seeds': 3}}")
+    values = as_values(settings) if isinstance(settings, Settings) else _plain(settings)
+    seeds = {"first_seed": asked.seed, "seeds": asked.seeds}
     plan = plan_of(
         asked,
-        _with_seeds(options.get("settings", DEFAULTS), asked),
+        settings_of({**values, **{key: value for key, value in seeds.items() if value is not None}}, "settings"),
         (source if isinstance(source, Sequence) else str(source),),
         _checked_own(options.get("own"), asked.estimators or ()),
         asked.workers,
@@ -230,14 +235,6 @@ def _checked_own(own: Mapping[str, Build] | None, named: Iterable[str]) -> Mappi
     if both:
         raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
     return own
-
-
-def _with_seeds(settings: Settings | Mapping[str, Any], run: _Asked) -> Settings:
-    if not isinstance(settings, Settings | Mapping):
-        raise SettingsError(f"settings is {type_of(settings)}; give nested values, as {{'seeds': 3}}")
-    values = as_values(settings) if isinstance(settings, Settings) else _plain(settings)
-    given = {"first_seed": run.seed, "seeds": run.seeds}
-    return settings_of({**values, **{key: value for key, value in given.items() if value is not None}}, "settings")
 
 
 def _plain(values: Mapping[Any, Any]) -> dict[str, Any]:

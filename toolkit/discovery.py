@@ -6,7 +6,6 @@ module directly in that package is one estimator, metric file or dataset. No lis
 
 import ast
 import importlib
-import importlib.machinery
 import importlib.util
 import pkgutil
 from collections.abc import Iterable
@@ -110,7 +109,12 @@ def announced(group: str) -> list[FoundModule]:
     """
     found: list[FoundModule] = []
     for package in sorted({point.value for point in entry_points(group=group)}):
-        spec = _spec(package)
+        try:
+            spec = importlib.util.find_spec(package)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{package}.".startswith(f"{error.name}."):
+                raise
+            spec = None  # a parent of the package does not exist
         if spec is None or spec.submodule_search_locations is None:
             raise ExtensionError(
                 f"the entry point {group} names {package}, which is not a package here; install what announces it again"
@@ -123,12 +127,3 @@ def announced(group: str) -> list[FoundModule]:
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
     """Return what installed distributions announce under a group; what is installed later is found by a new process."""
     return tuple(metadata.entry_points(group=group))
-
-
-def _spec(package: str) -> importlib.machinery.ModuleSpec | None:
-    try:
-        return importlib.util.find_spec(package)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{package}.".startswith(f"{error.name}."):
-            raise
-        return None  # a parent of the package does not exist

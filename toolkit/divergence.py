@@ -126,7 +126,10 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
         return np.empty(0)
     transition, noise = steps.predictions.transition[:, POSE], steps.predictions.noise[:, POSE, POSE]
     if steps.beliefs.layout.velocity is not None:
-        noise = noise + _slack(trajectory, steps.dt_s)
+        slack = (_VELOCITY_SLACK * steps.dt_s[:, None]) ** 2
+        if trajectory.v_world is None:  # without a velocity only the rotation can be compared
+            slack[:, 3:] = 1e12
+        noise = noise + slack[:, None] * np.eye(6)
     # In the tangent of the step's end.
     deviation = se3_log(se3_inverse(steps.predictions.T_world_imu) @ trajectory.T_world_imu[steps.end])
     cov = _LUMP_FRAMES * noise
@@ -134,14 +137,6 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
         cov = cov + _taken_away(trajectory.cov[steps.start], trajectory.cov[steps.end], transition, noise)
         cov = cov + _RESOLUTION**2 * _finite(trajectory.cov[steps.end][:, POSE, POSE])
     return mahalanobis_squared(deviation, cov)
-
-
-def _slack(trajectory: Trajectory, dt_s: Array) -> Array:
-    """Return the covariance (S, 6, 6) that corrections of velocity and biases may add to steps of the pose (S,)."""
-    slack = (_VELOCITY_SLACK * dt_s[:, None]) ** 2
-    if trajectory.v_world is None:  # without a velocity only the rotation can be compared
-        slack[:, 3:] = 1e12
-    return slack[:, None] * np.eye(6)
 
 
 def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Array) -> Array:

@@ -11,7 +11,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -186,23 +186,14 @@ def with_divergence(run: Run, sequence: Sequence) -> Run:
 
     ``sequence`` is what it read; the truth is not used.
     """
-    reasons = [contradiction(trajectory, sequence) for trajectory in _trajectories_to_check(run)] + [
-        gate_collapse(run.info)
-    ]
+    checked = [] if run.causal is None or run.final_is_causal else [run.causal]
+    if run.final is not None:
+        # A final state without a covariance is at least as certain as the causal one was.
+        lacks = run.final.cov is None and run.causal is not None and np.array_equal(run.causal.t_ns, run.final.t_ns)
+        checked.append(replace(run.final, cov=run.causal.cov) if lacks and run.causal is not None else run.final)
+    reasons = [*(contradiction(trajectory, sequence) for trajectory in checked), gate_collapse(run.info)]
     found = [f"the trajectory diverged: {reason}" for reason in dict.fromkeys(reasons) if reason is not None]
     return replace(run, status="diverged", log=(*run.log, *found)) if found else run
-
-
-def _trajectories_to_check(run: Run) -> Iterator[Trajectory]:
-    """Yield the trajectories of a run that are tested for divergence.
-
-    A final state without a covariance is at least as certain as the causal one was.
-    """
-    if run.causal is not None and not run.final_is_causal:
-        yield run.causal
-    if run.final is not None:
-        lacks = run.final.cov is None and run.causal is not None and np.array_equal(run.causal.t_ns, run.final.t_ns)
-        yield replace(run.final, cov=run.causal.cov) if lacks and run.causal is not None else run.final
 
 
 def _info(online: list[Estimate]) -> dict[str, Array]:

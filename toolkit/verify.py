@@ -498,7 +498,13 @@ def verify(subject: EstimatorEntry, word: str, progress: Progress = SILENT) -> V
                 watched.append(watch(build, sequence))
             except Exception as error:  # anybody's code, which may raise anything
                 raised = raised or f"{sequence.name}: {_error_message(error)}"
-        checks = [_runs(raised, declined)]
+        # An estimator may decline inputs that it is not made for, but not all.
+        whys = "; ".join(dict.fromkeys(declined.values()))
+        if raised or len(declined) == len(SCENARIOS):
+            checks = [_checked(_RUNS, "failed", raised or f"it declines every recording: {whys}")]
+        else:
+            told = f"not applicable to {', '.join(declined)}: {whys}" if declined else ""
+            checks = [_checked(_RUNS, "passed", told)]
         if watched:
             checks += [_check(name, partial(_first, watched, broken)) for name, (broken, _) in OF_A_RUN.items()]
             if any(next(_stated(one), None) for one in watched):
@@ -521,14 +527,6 @@ def verify(subject: EstimatorEntry, word: str, progress: Progress = SILENT) -> V
 
 def _checked(name: str, result: Result, found: str = "") -> CheckRecord:
     return CheckRecord(name=name, result=result, found=found, remedy=_REMEDIES[name] if result == "failed" else "")
-
-
-def _runs(raised: str, declined: Mapping[str, str]) -> CheckRecord:
-    """Judge how runs ended; an estimator may decline inputs that it is not made for, but not all."""
-    whys = "; ".join(dict.fromkeys(declined.values()))
-    if raised or len(declined) == len(SCENARIOS):
-        return _checked(_RUNS, "failed", raised or f"it declines every recording: {whys}")
-    return _checked(_RUNS, "passed", f"not applicable to {', '.join(declined)}: {whys}" if declined else "")
 
 
 def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:

@@ -89,7 +89,10 @@ def _run(given: list[str]) -> int:
     try:
         options = parser().parse_args(given)
         options.command_line = ["vislam", *given]
-        _check_current_directory()
+        try:  # relative paths and new processes need it
+            os.getcwd()  # noqa: PTH109
+        except FileNotFoundError as error:
+            raise SystemLimitError("the current directory is no longer there; change to another one") from error
         _check_memory()
         status: int = options.command(options)
     except SystemExit:  # argparse leaves this way, after a help text too
@@ -98,14 +101,6 @@ def _run(given: list[str]) -> int:
     # Here and not at the interpreter's end, where a closed pipe or a full disk looks like a defect.
     sys.stdout.flush()
     return status
-
-
-def _check_current_directory() -> None:
-    """Raise SystemLimitError where the current directory was removed: relative paths and new processes need it."""
-    try:
-        os.getcwd()  # noqa: PTH109
-    except FileNotFoundError as error:
-        raise SystemLimitError("the current directory is no longer there; change to another one") from error
 
 
 def _check_memory() -> None:
@@ -132,7 +127,14 @@ def _check_memory() -> None:
 def _prepare_streams() -> None:
     """Have characters that the terminal's encoding lacks written as escapes, and text without a reader be lost."""
     for number in range(3):
-        _open_where_closed(number)
+        try:
+            os.fstat(number)
+        except OSError:  # closed by the caller: it leads nowhere, lest a file opened later take its number
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            os.set_inheritable(number, True)  # a process started here has the three streams, too
     # Lest it tell in several lines, and in every process, that there is no place for its cache of fonts.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for name in ("stdout", "stderr"):
@@ -141,18 +143,6 @@ def _prepare_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _open_where_closed(number: int) -> None:
-    """Have a standard stream that the caller closed lead nowhere, lest a file opened later take its number."""
-    try:
-        os.fstat(number)
-    except OSError:
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        if nowhere != number:
-            os.dup2(nowhere, number)
-            os.close(nowhere)
-        os.set_inheritable(number, True)  # a process started here has the three streams, too
 
 
 def _unexpected(error: Exception) -> int:

@@ -136,35 +136,29 @@ def reproduce(options: argparse.Namespace) -> int:
 
     from msgspec.structs import replace
 
+    from toolkit.cli import parser
     from toolkit.files.documents import to_text
     from toolkit.report.differences import differences
     from toolkit.report.export import unpack_bundle
-    from toolkit.report.run_directory import read_run
+    from toolkit.report.run_directory import MANIFEST, read_run
 
     with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
         there = Path(folder) / "there"
         record = unpack_bundle(options.bundle, there)
         before = read_run(there)
         out = Path(folder) / "here" if options.out is None else options.out
-        _run_again(there, out, options)
+        sequence = [] if options.data is None else [options.data]
+        workers = [] if options.workers is None else ["--workers", str(options.workers)]
+        words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers, "--quiet"]
+        requested = parser().parse_args(words)
+        requested.command_line = ["vislam", *words]
+        requested.command(requested)
         found = replace(differences(before, read_run(out)), before=str(options.bundle), after=str(out))
     if options.json:
         print(to_text(found), end="")
     elif not options.quiet:
         _print(found, record, options.bundle)
     return 0 if found.same_results else 1
-
-
-def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
-    from toolkit.cli import parser
-    from toolkit.report.run_directory import MANIFEST
-
-    sequence = [] if options.data is None else [options.data]
-    workers = [] if options.workers is None else ["--workers", str(options.workers)]
-    words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers, "--quiet"]
-    requested = parser().parse_args(words)
-    requested.command_line = ["vislam", *words]
-    requested.command(requested)
 
 
 def _print(found: DiffRecord, record: BundleRecord, bundle: Path) -> None:
