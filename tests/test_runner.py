@@ -12,7 +12,7 @@ import pytest
 
 from toolkit import runner
 from toolkit.answers import Run
-from toolkit.errors import DataError, EstimatorError
+from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
@@ -176,11 +176,6 @@ def test_an_interrupt_that_compiled_code_wraps_is_no_failure_of_the_estimator(se
 
     with pytest.raises(KeyboardInterrupt):
         run(sequence, interrupted)
-
-
-def test_a_sequence_that_cannot_be_run_is_the_datas_fault_not_the_estimators(sequence):
-    with pytest.raises(DataError, match="not after the one before"):
-        run(replace(sequence, frames_t_ns=sequence.frames_t_ns[::-1]))
 
 
 def test_answers_of_the_documented_shapes_pass(sequence):

@@ -75,8 +75,3 @@ def test_what_the_help_repeats_is_what_there_is():
 
     assert set(recordings.SCENARIOS) == set(SCENARIOS)
     assert tuple(FORMATS) == runs.FORMATS
-
-
-def test_version_is_printed(vislam, capsys):
-    assert vislam("--version") == 0
-    assert re.fullmatch(r"vislam \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -74,7 +74,6 @@ def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter, capsys):
     ("estimators", "text", "told"),
     [
         ("my_filter", "", "is given as its file, as in my_filter.py"),
-        ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported"),
         ("ekf.py", "def build(setup): ...\n", "give the file another name"),
         ("my_filter.py,deeper/my_filter.py", "def build(setup): ...\n", "give the file another name"),
     ],

@@ -20,11 +20,8 @@ def work(stream: io.StringIO) -> str:
     return stream.getvalue()
 
 
-def test_short_work_leaves_nothing_in_a_log():
+def test_long_work_leaves_lines_with_the_time_left_in_a_log_and_short_work_nothing(monkeypatch):
     assert work(io.StringIO()) == ""
-
-
-def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch):
     monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
     monkeypatch.setattr(progress, "_LOG_SHARE", 0.0)
     lines = work(io.StringIO()).splitlines()

@@ -37,23 +37,14 @@ TRUTHS = {
 }
 
 
-def test_the_keys_are_those_of_metrics_json_in_its_order():
-    assert list(metrics.describe()) == KEYS
-
-
-def test_no_two_columns_have_the_same_name():
-    names = [name for metric in metrics.known_metrics() for name in {metric.key, metric.name}]
-    assert len(set(names)) == len(names)
-
-
-def test_a_description_is_one_line():
+def test_the_keys_are_those_of_metrics_json_in_its_order_each_described_in_a_line_and_on_the_page(request):
     described = metrics.describe()
+    assert list(described) == KEYS
     assert [key for key in KEYS if not described[key] or "\n" in described[key]] == []
-
-
-def test_every_key_is_documented(request):
     page = (request.config.rootpath / "docs" / "metrics.md").read_text(encoding="utf-8")
     assert [key for key in KEYS if f"`{key}`" not in page] == []
+    names = [name for metric in metrics.known_metrics() for name in {metric.key, metric.name}]
+    assert len(set(names)) == len(names), "two columns have the same name"
 
 
 @pytest.mark.parametrize("output", ["causal", "final"])
