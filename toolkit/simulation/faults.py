@@ -453,13 +453,23 @@ def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequenc
     density = np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
     still = rng.standard_normal((t_ns.size, 6)) * density / np.sqrt(period_ns / NS_PER_S)
     values = np.where(pause.within(t_ns)[:, None], still, motion.values[rows])
-    return replace(
-        sequence,
-        frames_t_ns=pause.inserted(sequence.frames_t_ns)[0],
-        observations=_seen_standing(sequence, halt, pause.stamps, rng),
-        motion=replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:]),
-        truth=None if sequence.truth is None else _truth_standing(sequence.truth, pause),
+    seen, truth = sequence.observations, sequence.truth
+    here = np.flatnonzero(seen.frame == halt)
+    standing, their_frames = seen.select(np.tile(here, pause.stamps)), np.repeat(np.arange(pause.stamps), here.size)
+    noise_px = rng.standard_normal((len(standing), 3)) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T
+    observations = Observations.sorted(
+        np.concatenate([seen.frame + pause.stamps * (seen.frame >= halt), halt + their_frames]),
+        np.concatenate([seen.track_id, standing.track_id]),
+        np.concatenate([seen.uv_px, standing.uv_px + noise_px]),
     )
+    if truth is not None:
+        true_t_ns, rows = pause.inserted(truth.t_ns)
+        v_world = None if truth.v_world is None else truth.v_world[rows] * ~pause.within(true_t_ns)[:, None]
+        bias = None if truth.bias is None else truth.bias[rows]
+        truth = replace(truth, t_ns=true_t_ns, T_world_imu=truth.T_world_imu[rows], v_world=v_world, bias=bias)
+    motion = replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
+    frames_t_ns = pause.inserted(sequence.frames_t_ns)[0]
+    return replace(sequence, frames_t_ns=frames_t_ns, observations=observations, motion=motion, truth=truth)
 
 
 class _Pause(NamedTuple):
@@ -479,30 +489,6 @@ class _Pause(NamedTuple):
     def within(self, t_ns: IntArray) -> BoolArray:
         """Say which stamps (N,) are in the pause."""
         return np.asarray((t_ns >= self.at_ns) & (t_ns < self.at_ns + self.stamps * self.period_ns))
-
-
-def _seen_standing(sequence: Sequence, halt: int, count: int, rng: np.random.Generator) -> Observations:
-    seen = sequence.observations
-    here = np.flatnonzero(seen.frame == halt)
-    standing = seen.select(np.tile(here, count))
-    noise_px = rng.standard_normal((len(standing), 3)) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T
-    return Observations.sorted(
-        np.concatenate([seen.frame + count * (seen.frame >= halt), np.repeat(halt + np.arange(count), here.size)]),
-        np.concatenate([seen.track_id, standing.track_id]),
-        np.concatenate([seen.uv_px, standing.uv_px + noise_px]),
-    )
-
-
-def _truth_standing(truth: Truth, pause: _Pause) -> Truth:
-    t_ns, rows = pause.inserted(truth.t_ns)
-    moves = ~pause.within(t_ns)[:, None]
-    return replace(
-        truth,
-        t_ns=t_ns,
-        T_world_imu=truth.T_world_imu[rows],
-        v_world=None if truth.v_world is None else truth.v_world[rows] * moves,
-        bias=None if truth.bias is None else truth.bias[rows],
-    )
 
 
 # Clocks ---------------------------------------------------------------------------------------------------------------

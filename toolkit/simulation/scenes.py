@@ -219,7 +219,7 @@ def road(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     travelled_m = np.cumsum(0.02 * np.linalg.norm(trajectory.position.at(fine_t_s, 1), axis=1))
     even_m = np.arange(travelled_m[0], travelled_m[-1], _ROAD_POSE_SPACING_M)
     path = trajectory.at(np.interp(even_m, travelled_m, fine_t_s)).T_world_imu
-    return Scene(trajectory, roadside(path, _ROAD_LANDMARKS_PER_POSE, _landmark_rng(drawn)))
+    return Scene(trajectory, roadside(path, _ROAD_LANDMARKS_PER_POSE, drawn or np.random.default_rng(_WORLD_SEED)))
 
 
 def _road_positions(t_s: Array, streets: _Streets) -> Array:
@@ -261,12 +261,9 @@ def hall(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     tilt = so3_exp(np.stack([zero, pitch, zero], axis=-1)) @ so3_exp(np.stack([roll, zero, zero], axis=-1))
     rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
     trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
-    return Scene(trajectory, room(HALL_LOWER_M, HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
-
-
-def _landmark_rng(drawn: np.random.Generator | None) -> np.random.Generator:
-    """Return the random stream of the landmarks: always the same one if the scene is not drawn."""
-    return np.random.default_rng(_WORLD_SEED) if drawn is None else drawn
+    return Scene(
+        trajectory, room(HALL_LOWER_M, HALL_UPPER_M, _HALL_LANDMARKS, drawn or np.random.default_rng(_WORLD_SEED))
+    )
 
 
 def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:

@@ -171,22 +171,18 @@ def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> _Problem:
 def _problem(sequence: Sequence, prior: Prior | None, poses: Array, v_world: Array, bias: Array) -> _Problem:
     """Return the problem about states (K, 4, 4), (K, 3), (K, 6), from the given prior or the measured start."""
     model = motion_model(sequence.noise, sequence.gravity_world)
-    start = model.initial_belief(_measured_start(sequence, poses[0]) if prior is None else prior)
+    if prior is None:
+        # As estimators start by default, placed at the first pose as their outputs are: with an IMU the tilt of the
+        # start is measured and stays, without one the whole pose is free.
+        measured = start_from_measurements(sequence)
+        placement = place_first(poses[0], measured.T_world_imu, sequence.motion_kind == "imu")
+        T_world_imu = placement.apply(measured.T_world_imu[None])[0]
+        v_start = T_world_imu[:3, :3] @ measured.T_world_imu[:3, :3].T @ measured.v_world
+        prior = replace(measured, T_world_imu=T_world_imu, v_world=v_start)
+    start = model.initial_belief(prior)
     states = tuple(Belief(start.layout, *state, start.cov) for state in zip(poses, v_world, bias, strict=True))
     packets, track_ids, points = _without_mismatches(tuple(sequence.packets()), poses, sequence.rig)
     return _Problem(sequence.rig, model, start, states, packets, track_ids, points)
-
-
-def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
-    """Return the state that estimators start from by default, placed at the first pose (4, 4) as their outputs are.
-
-    With an IMU its tilt is measured and stays; without one it is the whole pose.
-    """
-    start = start_from_measurements(sequence)
-    placement = place_first(first_pose, start.T_world_imu, sequence.motion_kind == "imu")
-    T_world_imu = placement.apply(start.T_world_imu[None])[0]
-    v_world = T_world_imu[:3, :3] @ start.T_world_imu[:3, :3].T @ start.v_world
-    return Prior(T_world_imu, v_world, start.bias, start.cov, start.source)
 
 
 def _motion_chi_square(problem: _Problem) -> float:
