@@ -70,7 +70,6 @@ def test_a_scale_and_strays_are_reported(walking: Sequence) -> None:
     short = walking.truncated(70)
     card = card_of(stretched_disparity(persistent_mismatch(short, 0.2, 4), 1.03))
     assert card.scale is not None
-    print("SCALE", card.scale, 1 / 1.03)
     assert card.scale.value == pytest.approx(1.0 / 1.03, abs=0.012)
     # A mismatch in the last sighting of a track, or of one too short, does not show.
     assert 0.07 < card.at_odds < 0.25

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from msgspec import to_builtins
 
-from tests.report.conftest import compared, rescored
-from toolkit.answers import Run
-from toolkit.datasets import load_sequence
+from tests.report.conftest import rescored
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Request, read_configuration, record_of
@@ -204,30 +202,21 @@ def build(comparison: Comparison) -> Document:
     return document
 
 
-@pytest.fixture(scope="module")
-def scored(run_estimator: Callable[..., Run]) -> Comparison:
-    """A filter that states covariances and innovations, and one that does not, on a short simulated drive."""
-    sequence = load_sequence("drive").truncated(40)
-    runs = tuple(run_estimator(name, sequence) for name in ("ekf", "dead-reckoning"))
-    return compared(sequence, runs)
-
-
 def run_of(document: Document, estimator: str, output: str = "causal") -> Document:
     runs = document["runs"]
     return next(run for run in runs if (run["estimator"], run["output"]) == (estimator, output))
 
 
-def test_errors_are_those_from_the_start_that_the_nees_takes(comparison: Comparison) -> None:
-    run, row = run_of(build(comparison), "late", "final"), comparison.rows[-2]
+def test_errors_are_those_from_the_start_that_the_nees_takes_and_components_stand_with_the_causal_entry(
+    comparison: Comparison,
+) -> None:
+    document = build(comparison)
+    run, row = run_of(document, "late", "final"), comparison.rows[-2]
     assert row.estimator == "late"
     expected_m = body_errors(Evaluation(row.run, "final", comparison.sequence)).distance_m
     np.testing.assert_allclose(run["errors"]["position_m"], expected_m, rtol=1e-5, atol=1e-9)
     path_m = run["errors"]["path_m"]
     assert np.all(np.diff(path_m) >= 0.0)
     assert path_m[0] == 0.0
-
-
-def test_components_stand_with_the_causal_entry_of_a_filter(scored: Comparison) -> None:
-    document = build(scored)
-    assert run_of(document, "ekf")["components"] == to_builtins(components(scored, scored.rows[0]))
-    assert "components" not in run_of(document, "ekf", "final")
+    assert run_of(document, "steady")["components"] == to_builtins(components(comparison, comparison.rows[0]))
+    assert "components" not in run_of(document, "steady", "final")

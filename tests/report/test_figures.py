@@ -57,13 +57,10 @@ def map_of(figure: Figure) -> Axes:
     return next(axes for axes in figure.axes if axes.get_xlabel() == "x [m]")
 
 
-def test_top_views_have_equal_scale(comparison: Comparison) -> None:
+def test_top_views_have_equal_scale_which_far_landmarks_do_not_squash(comparison: Comparison) -> None:
     shown = {one.name: one.figure for one in (*from_above.draw_all(comparison), *from_above.draw_each(comparison))}
     assert list(shown) == ["top_all", "top_steady", "top_astray", "top_late"]
     assert all(map_of(figure).get_aspect() == 1.0 for figure in shown.values())
-
-
-def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison) -> None:
     late = comparison.runs[2]
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
@@ -116,7 +113,9 @@ def stacked(found: dict[str, Array], *names: str) -> Array:
     return np.stack([found[name] for name in names], axis=1)
 
 
-def test_components_are_estimate_minus_truth_in_the_worlds_axes(offset: Comparison, sequence: Sequence) -> None:
+def test_components_are_estimate_minus_truth_in_the_worlds_axes_and_stated_deviations_turn_with_the_body(
+    offset: Comparison, sequence: Sequence
+) -> None:
     found, truth = of_offset(offset), sequence.truth
     assert truth is not None
     poses = interpolate_poses(truth.t_ns, truth.T_world_imu, sequence.frames_t_ns)
@@ -124,24 +123,25 @@ def test_components_are_estimate_minus_truth_in_the_worlds_axes(offset: Comparis
     np.testing.assert_allclose(stacked(found, "x_m", "y_m", "z_m"), poses[:, :3, :3] @ OFFSET_M, rtol=1e-5, atol=1e-12)
     turned_deg = stacked(found, "about_x_deg", "about_y_deg", "about_z_deg")
     np.testing.assert_allclose(np.linalg.norm(turned_deg, axis=1), 0.5, rtol=1e-5)
+    estimate = offset.runs[0].final
+    assert estimate is not None
+    sigma_m = stacked(found, "sigma_x_m", "sigma_y_m", "sigma_z_m")
+    np.testing.assert_allclose(sigma_m**2, (estimate.T_world_imu[:, :3, :3] ** 2) @ SIGMA_M**2, rtol=1e-4)
+    sigma_deg = stacked(found, "sigma_about_x_deg", "sigma_about_y_deg", "sigma_about_z_deg")
+    np.testing.assert_allclose((sigma_deg**2).sum(axis=1), (SIGMA_DEG**2).sum(), rtol=1e-4)
 
 
-def all_components(comparison: Comparison) -> list[NamedFigure]:
-    telling = over_time.draw_telling_components(comparison)
-    return [*telling, *over_time.draw_other_components(comparison)]
-
-
-def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comparison) -> None:
-    one = next(figure for figure in all_components(offset) if figure.name == "components_offset")
+def test_the_band_is_three_deviations_all_of_the_error_is_shown_and_the_share_in_it_is_the_metrics(
+    offset: Comparison,
+) -> None:
+    drawn = (*over_time.draw_telling_components(offset), *over_time.draw_other_components(offset))
+    one = next(figure for figure in drawn if figure.name == "components_offset")
     found, axes = of_offset(offset), one.figure.axes[0]
     lower, upper, error = (np.asarray(line.get_ydata()) for line in axes.get_lines()[:3])
     np.testing.assert_allclose(upper, 3.0 * found["sigma_x_m"])
     np.testing.assert_allclose(lower, -upper)
     np.testing.assert_allclose(error, found["x_m"])
     assert axes.get_ylim()[1] > np.abs(error).max()
-
-
-def test_the_share_in_the_band_is_the_metrics(offset: Comparison) -> None:
     (one,) = over_time.draw_nees(offset)
     (row,) = (row for row in offset.lines if row.estimator == "offset")
     share = row.value("nees_pose_in_band_percent")
@@ -190,13 +190,3 @@ def test_an_estimator_has_one_look_of_its_own_whatever_it_is_compared_with_and_o
         assert strokes[name, "causal"]["color"] == strokes[name, "final"]["color"]
         assert look_numbers([name])[name] == together[name]
     assert len({together[name] % COLOURS for name in (*defaults(), "one of my own")}) == len(defaults()) + 1
-
-
-def test_stated_deviations_turn_with_the_body(offset: Comparison) -> None:
-    found, estimate = of_offset(offset), offset.runs[0].final
-    assert estimate is not None
-    turn = estimate.T_world_imu[:, :3, :3]
-    sigma_m = stacked(found, "sigma_x_m", "sigma_y_m", "sigma_z_m")
-    np.testing.assert_allclose(sigma_m**2, (turn**2) @ SIGMA_M**2, rtol=1e-4)
-    sigma_deg = stacked(found, "sigma_about_x_deg", "sigma_about_y_deg", "sigma_about_z_deg")
-    np.testing.assert_allclose((sigma_deg**2).sum(axis=1), (SIGMA_DEG**2).sum(), rtol=1e-4)

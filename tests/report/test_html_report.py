@@ -32,11 +32,6 @@ def page(run_directory: Path) -> str:
     return page_text(payload_of([read_run(run_directory)]))
 
 
-def written(comparison: Comparison, target: Path) -> Path:
-    write_run(comparison, target, MadeBy("vislam compare"))
-    return target
-
-
 def embedded(page: str) -> Json:
     (text,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', page, flags=re.S)
     payload: Json = json.loads(text)
@@ -75,7 +70,8 @@ def test_tracks_are_aligned_as_the_metric_says(case: Json, estimator: str) -> No
 
 @pytest.mark.usefixtures("unrendered")
 def test_without_truth_there_is_a_page_too(without_truth: Comparison, tmp_path: Path) -> None:
-    (case,) = payload_of([read_run(written(without_truth, tmp_path / "run"))])["cases"]
+    write_run(without_truth, tmp_path / "run", MadeBy("vislam compare"))
+    (case,) = payload_of([read_run(tmp_path / "run")])["cases"]
     assert case["truth"] is None
     assert case["error"]["what"].startswith("difference from")
 

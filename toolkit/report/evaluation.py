@@ -298,7 +298,15 @@ def write_evaluation(
     Raises OutputError where that cannot be.
     """
     with replaced_directory(target, _ours) as directory:
-        captions = _written_figures(evaluation, directory / "figures", choice, kind)
+        captions: dict[str, str] = {}
+        if choice != "none":
+            # Here alone, for matplotlib takes long to import.
+            from toolkit.report.figures import literal, save
+            from toolkit.report.figures.trajectories import draw
+
+            (directory / "figures").mkdir()
+            drawn = map(literal, draw(evaluation, all_sequences=choice == "all"))
+            captions = save(drawn, directory / "figures", kind)
         figures = {directory / "figures" / name: caption for name, caption in captions.items()}
         document = replace(evaluation_document(evaluation), figures=tuple(captions))
         texts = (
@@ -309,19 +317,6 @@ def write_evaluation(
         )
         for name, text in zip(_FILES, texts, strict=True):
             (directory / name).write_text(text, encoding="utf-8")
-
-
-def _written_figures(
-    evaluation: EvaluatedSystems, folder: Path, choice: "FigureChoice", kind: "FigureFormat"
-) -> dict[str, str]:
-    if choice == "none":
-        return {}
-    # Here alone, for matplotlib takes long to import.
-    from toolkit.report.figures import literal, save
-    from toolkit.report.figures.trajectories import draw
-
-    folder.mkdir()
-    return save(map(literal, draw(evaluation, all_sequences=choice == "all")), folder, kind)
 
 
 def _ours(directory: Path) -> frozenset[str]:

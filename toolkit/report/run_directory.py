@@ -151,22 +151,18 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
         for name, text in _texts(comparison):
             (directory / name).parent.mkdir(exist_ok=True)
             _write_text(directory / name, text)
-        captions = _written_figures(comparison, directory / "figures", made_by)
+        captions: dict[str, str] = {}
+        (directory / "figures").mkdir()
+        if made_by.choice != "none":
+            # Here alone, for matplotlib takes long to import.
+            from toolkit.report.figures import drawn, save
+
+            captions = save(drawn(comparison, made_by.choice), directory / "figures", made_by.figures)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.request)
         written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
         manifest = msgspec.structs.replace(manifest, files=tuple(sorted([*written, MANIFEST])))
         _write_text(directory / MANIFEST, to_text(manifest))
-
-
-def _written_figures(comparison: Comparison, folder: Path, made_by: MadeBy) -> dict[str, str]:
-    folder.mkdir()
-    if made_by.choice == "none":
-        return {}
-    # Here alone, for matplotlib takes long to import.
-    from toolkit.report.figures import drawn, save
-
-    return save(drawn(comparison, made_by.choice), folder, made_by.figures)
 
 
 def _texts(comparison: Comparison) -> Iterator[tuple[str, str]]:
