@@ -16,13 +16,10 @@ two by two, as they meet faults, and what any of these comparisons says is a fal
 
     python tests/benchmarks/status_power.py run 1 runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table 1 runs.jsonl   power and false alarms; exit 1 beside the bar
-
-With --keep DIRECTORY every run is pickled there, and what is there already is evaluated by the code as it is, not run.
 """
 
 import argparse
 import json
-import pickle
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
@@ -33,7 +30,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from toolkit.answers import Output, Run, Status
+from toolkit.answers import Output, Run
 from toolkit.errors import VislamError
 from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.disagreement import too_far
@@ -44,7 +41,6 @@ from toolkit.metrics import Evaluation, ate, score_run
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.reprojection import RATIO
 from toolkit.progress import SILENT
-from toolkit.runner import with_divergence
 from toolkit.sequence import Observations
 from toolkit.sequence import Sequence as Recorded
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -205,7 +201,7 @@ def planted(scenario: Scenario) -> Recorded | None:
         return None
 
 
-def ended(draw: int, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
+def ended(draw: int, scenario: Scenario) -> Iterator[Ended]:
     """Run a scenario's estimators and put the truth back for their errors; nothing where the fault cannot be planted.
 
     A recording or a run that is refused has no error and says why.
@@ -219,8 +215,7 @@ def ended(draw: int, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
     for name in scenario.estimators:
         run = prepared
         if isinstance(prepared, Prepared):
-            kept = keep and keep / f"{scenario.name}_{name}.run"
-            run = _unless_refused(partial(_run, name, prepared, kept))
+            run = _unless_refused(partial(run_estimator, Unit(prepared, 0, name), prepared, SILENT))
         one = Ended(draw, scenario.recording, scenario.seed, scenario.fault, name)
         if isinstance(run, str):
             lines[name] = replace(one, status="refused", log=(run,))
@@ -244,19 +239,6 @@ def _unless_refused(make: Callable[[], Result]) -> Result | str:
         return make()
     except VislamError as reason:
         return str(reason)
-
-
-def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
-    """Run an estimator, or evaluate the run that is kept by the code as it is."""
-    if kept is not None and kept.exists():
-        run: Run = pickle.loads(kept.read_bytes())
-        log = tuple(line for line in run.log if not line.startswith("the trajectory diverged"))
-        status: Status = "ok" if run.status == "diverged" else run.status
-        return with_divergence(replace(run, status=status, log=log), prepared.sequence)
-    run = run_estimator(Unit(prepared, 0, name), prepared, SILENT)
-    if kept is not None:
-        kept.write_bytes(pickle.dumps(run))
-    return run
 
 
 def _scored(one: Ended, run: Run, outcome: Outcome, prepared: Prepared, with_truth: Recorded) -> Ended:
@@ -291,14 +273,14 @@ def _error_m(run: Run, sequence: Recorded) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)
 
 
-def run_draw(draw: int, file: Path, keep: Path | None) -> None:
+def run_draw(draw: int, file: Path) -> None:
     """Append a line a run to a file, without the scenarios that it has."""
     lines = read(file)
     done = {(one.recording, one.seed, one.fault, one.estimator) for one in lines}
     for scenario in scenarios(draw):
         where = (scenario.recording, scenario.seed, scenario.fault)
         missing = [name for name in scenario.estimators if (*where, name) not in done]
-        for one in ended(draw, scenario, keep) if missing else ():
+        for one in ended(draw, scenario) if missing else ():
             if one.estimator in missing:
                 with file.open("a") as out:
                     out.write(json.dumps(asdict(one)) + "\n")
@@ -355,10 +337,9 @@ def main(words: list[str]) -> int:
     parser.add_argument("what", choices=("run", "table"))
     parser.add_argument("draw", type=int, help="its number, 1 or more")
     parser.add_argument("file", type=Path)
-    parser.add_argument("--keep", type=Path, metavar="DIRECTORY")
     wanted = parser.parse_args(words)
     if wanted.what == "run":
-        run_draw(wanted.draw, wanted.file, wanted.keep)
+        run_draw(wanted.draw, wanted.file)
         return 0
     return 0 if print_table([one for one in read(wanted.file) if one.draw == wanted.draw]) else 1
 

@@ -13,7 +13,6 @@ import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -118,16 +117,14 @@ def film(
 
 
 def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Progress) -> None:
-    done = count(1)
-
     def shoot(k: int) -> None:
         for side, camera in enumerate(_CAMERAS):
             (mav0 / camera / "data" / f"{frames_t_ns[k]}.png").write_bytes(crew.png(k, frames_t_ns[k], side))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for _ in pool.map(shoot, range(len(frames_t_ns))):
-                progress.advance(next(done), len(frames_t_ns), "rendering")
+            for done, _ in enumerate(pool.map(shoot, range(len(frames_t_ns))), start=1):
+                progress.advance(done, len(frames_t_ns), "rendering")
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
