@@ -87,7 +87,11 @@ def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Es
     earlier = None if before is None else before.cov
     if earlier is not None and answer.cov is not None and earlier.shape != answer.cov.shape:
         raise EstimatorError(f"cov {where} has shape {answer.cov.shape}, and {earlier.shape} before; keep to one")
-    _check_info(answer.info, where)
+    if not isinstance(answer.info, Mapping):
+        raise EstimatorError(f"info {where} is {type_of(answer.info)}; it is a dict of numbers by name")
+    for name, value in answer.info.items():
+        if not isinstance(name, str) or not isinstance(value, float | int | np.number):
+            raise EstimatorError(f"info {where} has {name!r}: {value!r}; it is a dict of numbers by name")
     estimate: Estimate = answer
     return estimate
 
@@ -139,11 +143,3 @@ def _check_array(what: str, value: Any, shapes: tuple[tuple[int, ...], ...], *, 
         raise EstimatorError(f"{what} has the type {value.dtype}; it is an array of real numbers")
     if value.shape not in shapes:
         raise EstimatorError(f"{what} has shape {value.shape}; expected {' or '.join(map(str, shapes))}")
-
-
-def _check_info(info: Any, where: str) -> None:
-    if not isinstance(info, Mapping):
-        raise EstimatorError(f"info {where} is {type_of(info)}; it is a dict of numbers by name")
-    for name, value in info.items():
-        if not isinstance(name, str) or not isinstance(value, float | int | np.number):
-            raise EstimatorError(f"info {where} has {name!r}: {value!r}; it is a dict of numbers by name")

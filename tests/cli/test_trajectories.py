@@ -80,14 +80,16 @@ def test_an_export_with_covariances_has_the_nees_of_the_run(again, name):
         assert theirs[key] == pytest.approx(ours[key], rel=1e-9)
 
 
-def test_the_state_of_a_run_is_exported_whole(run, tmp_path):
+def test_the_truth_and_the_state_of_either_output_are_exported_whole(run, tmp_path):
     target = tmp_path / "state.txt"
-    words = ("export", str(run), "--estimator", "ekf", "--format", "openvins", "--out", str(target))
-    assert main([*words]) == 0
+    end = ("--format", "openvins", "--out", str(target))
+    for words in (("truth",), ("ekf", "--output", "causal"), ("ekf", "--output", "final")):
+        assert main(["export", str(run), "--estimator", *words, *end]) == 0
+        assert len(read_poses(target)) == 20
     values = np.loadtxt(target)
     assert values.shape == (20, 17)
     assert np.isfinite(values[:, 11:14]).all()  # the gyro bias is estimated beside twists
-    assert main(["export", str(run), "--estimator", "truth", *words[4:], "--cov-convention", "rot-pos/right"]) == 3
+    assert main(["export", str(run), "--estimator", "truth", *end, "--cov-convention", "rot-pos/right"]) == 3
 
 
 def test_another_system_is_in_everything_a_comparison_leaves(again):
@@ -133,9 +135,3 @@ def test_what_cannot_be_exported_is_reported_with_what_can(vislam, one_line, run
     assert vislam("export", str(directory), *words, "--format", "kitti", "--out", "out") == 3
     assert why in one_line()
     assert not Path("out").exists()
-
-
-def test_the_truth_and_either_output_can_be_exported(vislam, run):
-    for words in (("truth",), ("ekf", "--output", "causal"), ("ekf", "--output", "final")):
-        assert vislam("export", str(run), "--estimator", *words, "--format", "euroc", "--out", "out.csv") == 0
-        assert len(read_poses(Path("out.csv"))) == 20

@@ -99,12 +99,13 @@ def test_without_noise_it_recovers_the_truth_and_its_landmarks_are_where_they_ar
 
 
 @both_kinds
-def test_without_vision_it_goes_on(name: str, build: Build, scenario: str) -> None:
-    whole = recording(scenario).truncated(20)
-    sequence = replace(whole, observations=whole.observations.select(whole.observations.frame < 0))
+@pytest.mark.parametrize(("frames", "sees"), [(20, False), (2, True)], ids=["without vision", "with two frames"])
+def test_it_goes_on_with_little(name: str, build: Build, scenario: str, frames: int, *, sees: bool) -> None:
+    whole = recording(scenario).truncated(frames)
+    sequence = whole if sees else replace(whole, observations=whole.observations.select(whole.observations.frame < 0))
     run = run_on(name, build, sequence)
     assert run.status == "ok", run.log
-    assert len(run.final) == sequence.frame_count
+    assert len(run.final) == frames
 
 
 def test_without_noise_and_a_third_of_the_right_images_it_recovers_the_truth(name: str, build: Build) -> None:
@@ -161,13 +162,6 @@ def test_a_packet_that_is_not_a_number_never_ends_in_a_finite_lie(name, build, s
     monkeypatch.setattr("toolkit.sequence.check_runnable", lambda sequence: None)
     run = run_on(name, build, with_nan(recording(scenario).truncated(FRAMES_WITH_NAN), "motion sample"))
     assert run.status != "ok"
-
-
-@both_kinds
-def test_two_frames_are_enough(name: str, build: Build, scenario: str) -> None:
-    run = run_on(name, build, recording(scenario).truncated(2))
-    assert run.status == "ok", run.log
-    assert len(run.final) == 2
 
 
 def test_every_estimator_has_a_one_line_summary(name: str) -> None:

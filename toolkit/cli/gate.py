@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from toolkit.evaluation.against_baseline import GivenRuns
     from toolkit.gate.baseline import Case
     from toolkit.gate.verdict import Check
-    from toolkit.settings import Settings
 
 SEEDS, FEWEST_SEEDS = 24, 5
 _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json": "JSON"}
@@ -90,7 +89,11 @@ def baseline(options: argparse.Namespace) -> int:
     from toolkit.gate.checking import new_baseline
     from toolkit.report.manifest import made_here
 
-    cases, settings = _cases(options), _settings(options)
+    cases = _cases(options)
+    for text in options.set:
+        if text.partition("=")[0].strip() in ("first_seed", "seeds", "vary"):
+            raise UsageError(f"--set {text} is for compare; a baseline's --seeds are from 0, and draw the noise")
+    settings = requested_settings(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
     check_writable(out, "{")
     made_by = made_here(_command_to_keep(options.command_line))
@@ -104,14 +107,6 @@ def baseline(options: argparse.Namespace) -> int:
     ]
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
     return 1 if ends else 0
-
-
-def _settings(options: argparse.Namespace) -> Settings:
-    """Return the settings of a baseline; raises UsageError for those of the seeds, which it has in its cases."""
-    for text in options.set:
-        if text.partition("=")[0].strip() in ("first_seed", "seeds", "vary"):
-            raise UsageError(f"--set {text} is for compare; a baseline's --seeds are from 0, and draw the noise")
-    return requested_settings(options)
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:

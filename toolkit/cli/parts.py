@@ -11,8 +11,6 @@ from toolkit.cli.arguments import arg, choice, command, output
 
 if TYPE_CHECKING:
     from toolkit.registry import EstimatorEntry
-    from toolkit.settings.reading import Described
-    from toolkit.simulation.faults import Injector
 
 KINDS = ("estimators", "metrics", "faults", "injectors", "settings", "formats", "sequences")
 # How many names of each kind stand for all of it.
@@ -71,9 +69,12 @@ def entries(kind: str) -> Mapping[str, str]:
         case "faults":
             entries = faults()
         case "injectors":
-            entries = {name: _injector(one) for name, one in INJECTORS.items()}
+            entries = {name: f"{one.meaning} [{one.unit}, none at {one.clean:g}]" for name, one in INJECTORS.items()}
         case "settings":
-            entries = {one.key: _setting(one) for one in describe()}
+            entries = {
+                one.key: f"{one.meaning} [{', '.join(filter(None, (one.unit, f'default {one.default}', one.range)))}]"
+                for one in describe()
+            }
         case "formats":
             entries = datasets.formats() | _marked(datasets.unavailable())
         case _:
@@ -89,15 +90,6 @@ def _summary(kind: str, names: list[str]) -> str:
 def _estimator(entry: EstimatorEntry) -> str:
     ignored = "".join(f" (not {rule}: {why})" for rule, why in entry.ignores().items())
     return f"{entry.summary()}{' (default)' if entry.is_default() else ''}{ignored}"
-
-
-def _injector(one: Injector) -> str:
-    return f"{one.meaning} [{one.unit}, none at {one.clean:g}]"
-
-
-def _setting(one: Described) -> str:
-    facts = (one.unit, f"default {one.default}", one.range)
-    return f"{one.meaning} [{', '.join(filter(None, facts))}]"
 
 
 def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:

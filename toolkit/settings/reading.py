@@ -139,14 +139,10 @@ def assigned(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SettingsError(f"--set takes KEY=VALUE, as in window.lag_s=3, not {text!r}")
-    return key.strip(), _value(value.strip())
-
-
-def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+        return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:  # a bare word
+        return key.strip(), value.strip()
 
 
 def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, place: str) -> None:
