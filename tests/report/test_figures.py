@@ -72,9 +72,8 @@ def test_top_views_have_equal_scale_which_far_landmarks_do_not_squash(comparison
 
 def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
     (drawn,) = over_time.draw_errors(comparison)
-    curves = error_curves(comparison)
-    assert curves is not None
-    good_m = max(max(errors.position_m) for row, errors in curves.of_rows.items() if row.status == "ok")
+    _, curves = error_curves(comparison)
+    good_m = max(max(errors.position_m) for row, errors in curves.items() if row.status == "ok")
     position, _ = drawn.figure.axes
     assert position.get_ylim()[1] < 2.0 * good_m
     assert "astray" in position.get_title(loc="right")

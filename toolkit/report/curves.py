@@ -222,15 +222,10 @@ def shown_output(run: Run) -> Output:
     return "final" if run.final is not None else "causal"
 
 
-class ErrorCurves(NamedTuple):
-    """What the errors of a comparison are, and those of each row of the table."""
-
-    kind: ErrorKind
-    of_rows: dict[Row, ErrorSeries]
-
-
-def error_curves(comparison: Comparison) -> ErrorCurves | None:
-    """Return every row's errors from the common start (with truth) or differences (without), or None without any."""
+def error_curves(comparison: Comparison) -> tuple[ErrorKind | None, dict[Row, ErrorSeries]]:
+    """Return what the errors are, and each row's: from the common start, without truth differences; None and no row
+    where there are none.
+    """
     sequence, reference = comparison.sequence, truth_during(comparison.sequence)
     estimate = reference_estimate(comparison) if reference is None else None
     if reference is not None:
@@ -243,7 +238,7 @@ def error_curves(comparison: Comparison) -> ErrorCurves | None:
         )
         kind = ErrorKind(what=f"difference from {estimate.name}", placing="not aligned", caption=caption)
     else:
-        return None
+        return None, {}
     curves: dict[Row, ErrorSeries] = {}
     for row in comparison.lines:
         output = shown_as(row)
@@ -254,7 +249,7 @@ def error_curves(comparison: Comparison) -> ErrorCurves | None:
         errors = errors_to(reference, trajectory, placed, sequence)
         if errors is not None:
             curves[row] = errors
-    return ErrorCurves(kind, curves) if curves else None
+    return kind if curves else None, curves
 
 
 def components(comparison: Comparison, row: Row) -> ComponentSeries | None:

@@ -187,14 +187,13 @@ def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, 
 
 
 def report_document(comparison: Comparison) -> Report:
-    curves = error_curves(comparison)
-    errors = {} if curves is None else curves.of_rows
+    kind, errors = error_curves(comparison)
     return Report(
         schema="vislam.report/1",
         start_ns=int(comparison.sequence.frames_t_ns[0]),
         truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
         alignment=alignment_text(comparison.sequence),
-        error=None if curves is None else curves.kind,
+        error=kind,
         runs=tuple(_row(row, comparison, errors.get(row)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
         maps=tuple(

@@ -48,24 +48,24 @@ _LEAST = 1e-3
 
 def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
-    curves = error_curves(comparison)
-    if curves is None:
+    kind, curves = error_curves(comparison)
+    if kind is None:
         return
-    figure, kind = style.new_figure(4.4), curves.kind
+    figure = style.new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
-    position_m = {row: _known(errors.position_m) for row, errors in curves.of_rows.items()}
-    heading_deg = {row: np.abs(_known(errors.heading_deg)) for row, errors in curves.of_rows.items()}
+    position_m = {row: _known(errors.position_m) for row, errors in curves.items()}
+    heading_deg = {row: np.abs(_known(errors.heading_deg)) for row, errors in curves.items()}
     for axes, unit, of_rows in ((position, "m", position_m), (heading, "deg", heading_deg)):
         for row, sizes in of_rows.items():
             stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
             width = style.width_of(comparison, row.estimator)
-            axes.plot(curves.of_rows[row].t_s, sizes, linewidth=width, **stroke)
+            axes.plot(curves[row].t_s, sizes, linewidth=width, **stroke)
         _scale(axes, of_rows, unit)
     style.label_axes(position, f"{comparison.name}: position {kind.what}, {kind.placing}", "", "position [m]")
     style.label_axes(heading, f"size of the heading {kind.what}", "time [s]", "|heading| [deg]")
     figure.align_ylabels()
     told = {row.estimator: f"{number(rmse(sizes))} m" for row, sizes in position_m.items()}
-    entries = style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row in curves.of_rows])
+    entries = style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row in curves])
     style.legend_below(figure, [entry._replace(label=f"{entry.label}: {told[entry.label]}") for entry in entries])
     caption = f"Position and heading {kind.what} over time, in the legend the RMS of the position, of the final output"
     yield NamedFigure("errors_over_time", f"{caption} where there is one. {kind.caption}", figure)
