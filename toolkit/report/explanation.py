@@ -18,7 +18,7 @@ from toolkit.files.documents import Count, reader, rounded
 from toolkit.metrics import metrics_called
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
 from toolkit.report.results_folder import Results, Shown
-from toolkit.report.text import MISSING, Table, number
+from toolkit.report.text import MISSING, Table, listed, number
 from toolkit.settings import changes_of
 
 Kind = Literal["added", "taken"]
@@ -262,7 +262,7 @@ def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
         effects.sort(key=lambda pair: -abs(math.log(pair[0].factor)))
         clauses = [_size_told(change, f"with {ingredient} ") for change, ingredient in effects[:_MOST_NAMED]]
         if clauses:
-            told.append(f"{name} is {_joined(clauses)}")
+            told.append(f"{name} is {listed(clauses)}")
     if told:
         yield f"Other figures show more than the error, beyond chance: {'; '.join(told)}."
 
@@ -282,7 +282,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
         yield f"Perhaps the error is {said}; among {_tests(found)} tests that may be chance: more data would tell."
     unknown = [part for part in silent if not any(one.error for one in part.effects)]
     if unknown and found.gap.error is not None:
-        yield f"Too few runs ended well to tell of {_joined([part.ingredient for part in unknown])}."
+        yield f"Too few runs ended well to tell of {listed((part.ingredient for part in unknown), len(unknown))}."
     rest = [part for part in silent if part not in (*likely, *unknown)]
     if still_open := [
         part
@@ -315,7 +315,7 @@ def _where_likely(found: ExplanationRecord, parts: Sequence[IngredientRecord]) -
         ends = [(of_second, one.error) for of_second, _, one in placed(found, part) if one.error and one.error.is_off]
         ranges = [f"{error.range()} near {found.gap.more if last else found.gap.less}" for last, error in ends]
         texts.append(f"{part.ingredient} ({', '.join(ranges)})")
-    return _joined(texts)
+    return listed(texts, len(texts))
 
 
 def _listed(parts: Sequence[IngredientRecord]) -> str:
@@ -325,12 +325,7 @@ def _listed(parts: Sequence[IngredientRecord]) -> str:
         known = [one.error for one in part.effects if one.error]
         whole = FactorRecord(factor=1.0, low=min(e.low for e in known), high=max(e.high for e in known))
         texts.append(f"{part.ingredient} ({whole.range()})")
-    return _joined(texts)
-
-
-def _joined(texts: Sequence[str]) -> str:
-    *most, last = texts
-    return " and ".join(filter(None, (", ".join(most), last)))
+    return listed(texts, len(texts))
 
 
 def explanation_table(found: ExplanationRecord) -> Table:

@@ -111,11 +111,11 @@ def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
         yield filled(entry, width, f"{label:<{_LABEL}}", " " * (_LABEL + 2))
 
 
-def listed(names: Iterable[str]) -> str:
-    """Return names as in a sentence: "a", "a and b", "a, b and c", "a, b, c and 4 more"."""
+def listed(names: Iterable[str], most: int = _MOST_NAMES) -> str:
+    """Return names as in a sentence, as "a, b and c", or of more than ``most`` as "a, b, c and 4 more"."""
     given = list(dict.fromkeys(names)) or [""]
-    if len(given) > _MOST_NAMES:
-        given = [*given[: _MOST_NAMES - 1], f"{len(given) - _MOST_NAMES + 1} more"]
+    if len(given) > most:
+        given = [*given[: most - 1], f"{len(given) - most + 1} more"]
     return " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
 
 
