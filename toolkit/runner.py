@@ -21,7 +21,7 @@ import numpy as np
 from toolkit.answers import Run, Status, Timings, checked_estimate, checked_finish
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError, in_words, one_line
-from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.estimate import Estimate, Landmarks, Trajectory
 from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Prior, TwistChangeNoise
@@ -117,7 +117,14 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         if (interrupt := _interrupt_behind(error)) is not None:
             raise interrupt from None
         return _failed(name, online, clock.timings(), error)
-    return _ended(name, online, finished, clock.timings(), sequence)
+    timings, causal = clock.timings(), Trajectory.of(online) if online else None
+    status: Status = "ok"
+    log = list(finished.log)
+    if not finished.converged:
+        status = "failed"
+        log.insert(0, "the solve did not converge; its result is shown but is no estimate to rely on")
+    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(online), tuple(log))
+    return with_divergence(run, sequence)
 
 
 def setup_of(
@@ -168,17 +175,6 @@ def _reason(error: BaseException) -> str:
             "(noise.pixel_sigma_px, noise.motion_scale)"
         )
     return in_words(error)
-
-
-def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
-    causal = Trajectory.of(online) if online else None
-    status: Status = "ok"
-    log = list(finished.log)
-    if not finished.converged:
-        status = "failed"
-        log.insert(0, "the solve did not converge; its result is shown but is no estimate to rely on")
-    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(online), tuple(log))
-    return with_divergence(run, sequence)
 
 
 def with_divergence(run: Run, sequence: Sequence) -> Run:

@@ -21,14 +21,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
 
+from tests.contracts.conftest import Files
 from toolkit import datasets
 from toolkit.cli import main
 from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import VislamError
 
-# A recording as its files: the content by the name in the folder; one file alone has the name "".
-Files = dict[str, bytes]
 Original = Callable[[str], Files]
 Test = Callable[..., None]
 VALUES = ("nan", "inf", "-inf", "0", "-1", "1e300", "-1e300", "1e-300", "1e19", "99999999999999999999", "", "x", "null")
