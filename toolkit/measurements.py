@@ -103,7 +103,23 @@ class StereoFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class TwistNoise:
+class _Densities:
+    """Continuous densities; names of white ones end in ``_density``, of walks of biases in ``_random_walk``."""
+
+    def scaled(self, factor: float) -> Self:
+        """Return the noise with its white densities scaled; the random walks stay."""
+        return self._multiplied("_density", factor)
+
+    def with_biases_held(self, share: float) -> Self:
+        """Return the noise with a share of the random walks."""
+        return self._multiplied("_random_walk", share)
+
+    def _multiplied(self, kind: str, factor: float) -> Self:
+        return replace(self, **{name: factor * value for name, value in vars(self).items() if name.endswith(kind)})
+
+
+@dataclass(frozen=True, eq=False)
+class TwistNoise(_Densities):
     """Continuous white-noise densities of a measured body twist, per axis (3,), and of the gyro bias' walk.
 
     Units: m/s/sqrt(Hz), rad/s/sqrt(Hz), rad/s^2/sqrt(Hz).
@@ -116,18 +132,9 @@ class TwistNoise:
     def __post_init__(self) -> None:
         freeze_arrays(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
 
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walk stays."""
-        velocity, gyro = factor * self.velocity_noise_density, factor * self.gyro_noise_density
-        return replace(self, velocity_noise_density=velocity, gyro_noise_density=gyro)
-
-    def with_biases_held(self, share: float) -> Self:
-        """Return the noise with a share of the random walk."""
-        return replace(self, gyro_random_walk=share * self.gyro_random_walk)
-
 
 @dataclass(frozen=True)
-class ImuNoise:
+class ImuNoise(_Densities):
     """Continuous noise densities of an IMU, with Kalibr's names.
 
     Units: m/s^2/sqrt(Hz), rad/s/sqrt(Hz), m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz).
@@ -138,19 +145,9 @@ class ImuNoise:
     accel_random_walk: float
     gyro_random_walk: float
 
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walks stay."""
-        accel, gyro = factor * self.accel_noise_density, factor * self.gyro_noise_density
-        return replace(self, accel_noise_density=accel, gyro_noise_density=gyro)
-
-    def with_biases_held(self, share: float) -> Self:
-        """Return the noise with a share of the random walks."""
-        accel, gyro = share * self.accel_random_walk, share * self.gyro_random_walk
-        return replace(self, accel_random_walk=accel, gyro_random_walk=gyro)
-
 
 @dataclass(frozen=True, eq=False)
-class TwistChangeNoise:
+class TwistChangeNoise(_Densities):
     """Densities of the white noise on the change of an unmeasured twist, per axis (3,), in the IMU frame.
 
     Units: m/s^2/sqrt(Hz) of the velocity, rad/s^2/sqrt(Hz) of the turn rate.
@@ -161,11 +158,6 @@ class TwistChangeNoise:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, velocity_change_density=(3,), turn_change_density=(3,))
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its densities scaled."""
-        velocity, turn = factor * self.velocity_change_density, factor * self.turn_change_density
-        return replace(self, velocity_change_density=velocity, turn_change_density=turn)
 
 
 MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
