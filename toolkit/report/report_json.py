@@ -4,7 +4,6 @@ It has two forms: of a comparison, and of one over seeds. First the records of b
 Times ``t_s`` count from the first frame; numbers have six digits; a value that is not finite is null.
 """
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
@@ -195,7 +194,16 @@ def report_document(comparison: Comparison) -> Report:
         alignment=alignment_text(comparison.sequence),
         error=kind,
         runs=tuple(_row(row, comparison, errors.get(row)) for row in comparison.rows),
-        steps=tuple(_steps(comparison)),
+        steps=tuple(
+            StepTimes(
+                estimator=run.estimator,
+                t_s=seconds(comparison.sequence, comparison.sequence.frames_t_ns[: run.timings.step_s.size]),
+                step_ms=numbers(1e3 * run.timings.step_s),
+                finish_s=number(run.timings.finish_s),
+            )
+            for run in comparison.runs
+            if run.timings is not None and run.timings.step_s.size
+        ),
         maps=tuple(
             DrawnMap(estimator=run.estimator, landmarks=file_of("landmarks", run.estimator), output=shown_output(run))
             for run in comparison.runs
@@ -253,18 +261,6 @@ def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnR
 def _vector(values: Array) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _steps(comparison: Comparison) -> Iterator[StepTimes]:
-    sequence = comparison.sequence
-    for run in comparison.runs:
-        if run.timings is not None and run.timings.step_s.size:
-            yield StepTimes(
-                estimator=run.estimator,
-                t_s=seconds(sequence, sequence.frames_t_ns[: run.timings.step_s.size]),
-                step_ms=numbers(1e3 * run.timings.step_s),
-                finish_s=number(run.timings.finish_s),
-            )
 
 
 def _over_seeds(group: Row) -> DrawnOverSeeds:

@@ -74,10 +74,7 @@ class Results(Generic[Record]):
         check_replaceable(target, self._ours)
 
     def _ours(self, directory: Path) -> frozenset[str]:
-        def written(folder: Path) -> tuple[str, ...]:
-            return (self.document, PAGE, *self.shown(self.read(folder / self.document)).files)
-
-        return own_files(directory, written)
+        return own_files(directory, lambda at: (self.document, PAGE, *self.shown(self.read(at / self.document)).files))
 
     def text(self, record: Record, width: Width = None) -> str:
         shown = self.shown(record)
