@@ -732,6 +732,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     "odometry": [
         (edit("calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
         (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "P0 holds text, expected real numbers"),
+        (edit("calib.txt", "P1", "P0: 1 2 3\nP1"), "P0 is there twice with other numbers; remove the wrong row"),
         (
             text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
             "1 poses for 5 images; cut both alike, or take the poses of this sequence",

@@ -42,7 +42,7 @@ from toolkit.datasets.io.image_pairs import (
 from toolkit.datasets.io.tables import is_number
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.formats import read_rows
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
@@ -180,7 +180,11 @@ def _calibration(file: Path, where: str) -> Fields:
         key, colon, rest = line.rpartition(":")
         words = rest.split()
         values = np.array(list(map(float, words)) if all(map(is_number, words)) else words)
-        arrays[key.strip() if colon else f"P{row}"] = values
+        name = key.strip() if colon else f"P{row}"
+        before = arrays.get(name, values)
+        if before.dtype == values.dtype == np.float64 and not np.array_equal(before, values, equal_nan=True):
+            raise DataError(f"{file}: {printable(name)} is there twice with other numbers; remove the wrong row")
+        arrays[name] = values
     return Fields(file, arrays)
 
 
