@@ -65,8 +65,12 @@ def load(path: Path) -> Sequence:
     if not isinstance(features, np.ndarray):
         return _sequence(parts, rig, NO_SIGHTINGS, (NO_FEATURES,))
     frame, track, corners_px, facts = corners_of(path, _FEATURES, features, parts.t_ns.size)
-    seen = rectified_observations(path, frame, track, _as_one_camera(parts, corners_px))
-    return _sequence(parts, rig, seen, facts)
+    left, right = parts.K
+    if not np.array_equal(left, right):
+        # The right corners become those that the left camera would see from there.
+        scale = np.diag(left)[:2] / np.diag(right)[:2]
+        corners_px[:, 2:] = (corners_px[:, 2:] - right[:2, 2]) * scale + left[:2, 2]
+    return _sequence(parts, rig, rectified_observations(path, frame, track, corners_px), facts)
 
 
 def uses_images(path: Path, tracks: Tracks) -> bool:
@@ -152,15 +156,6 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
         motion=TwistSamples(parts.t_ns, parts.v_mps, parts.w_radps),
         provenance=Provenance("course-npy", str(parts.path), (*facts, *parts.facts, EXTRINSIC_UNCERTAIN)),
     )
-
-
-def _as_one_camera(parts: _Parts, corners_px: Array) -> Array:
-    """Return corners (N, 4) px with the right ones as the left camera would see them from there."""
-    left, right = parts.K
-    if np.array_equal(left, right):
-        return corners_px
-    scale, centres = np.diag(left)[:2] / np.diag(right)[:2], (left[:2, 2], right[:2, 2])
-    return np.hstack([corners_px[:, :2], (corners_px[:, 2:] - centres[1]) * scale + centres[0]])
 
 
 def _beside(path: Path) -> Path:

@@ -46,7 +46,6 @@ def load(path: Path) -> Sequence:
         fields.require(*_REQUIRED)
         t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
         check_frame_count(path, t_ns.size)
-        _check_features_named(path, archive.keys)
         seen, facts = _sightings(path, archive, t_ns.size)
     rates = "angular_velocity" if "angular_velocity" in fields else "rotational_velocity"
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
@@ -65,16 +64,6 @@ def load(path: Path) -> Sequence:
     )
 
 
-def _check_features_named(path: Path, keys: list[str]) -> None:
-    """Raise DataError where features are missing and an array is there whose name is a misspelt one.
-
-    A recording without features is one of odometry alone, and nobody may take theirs for that by an oversight.
-    """
-    close = "" if "features" in keys else nearest("features", set(keys) - _NAMES)
-    if close:
-        raise DataError(f"{path}: missing features (rename {close}?); without image features leave {close} out")
-
-
 def _rig(fields: Fields) -> StereoRig:
     K = camera_matrix(fields.path, "K", fields.constant("K", 3, 3))
     T_imu_cam = fields.rigid("imu_T_cam") if "imu_T_cam" in fields else se3_inverse(fields.rigid("cam_T_imu"))
@@ -90,6 +79,9 @@ def _check_alike(fields: Fields, one: str, of_one: Array, other: str, of_other: 
 
 def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> tuple[Observations, tuple[str, ...]]:
     if "features" not in archive.keys:
+        # Without features it is a recording of odometry alone, and nobody may take theirs for that by an oversight.
+        if close := nearest("features", set(archive.keys) - _NAMES):
+            raise DataError(f"{path}: missing features (rename {close}?); without image features leave {close} out")
         return NO_SIGHTINGS, (NO_FEATURES,)
     frame, track, corners_px, facts = archive.corners("features", frame_count)
     return rectified_observations(path, frame, track, corners_px), facts

@@ -165,6 +165,11 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     truth = truth_at(choice.truth, frames_t_ns)
     points = _room_around(layout.root, truth.T_world_imu[:, :3, 3])
     camera = CameraLimits(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
+    kind, errors = SIMULATED, ", and errors of the truth appear as errors of the IMU"
+    if is_simulated(layout.root):
+        kind, errors = ALL_SIMULATED, ""
+    tracks = f"{_MAX_TRACKS} a frame, {PIXEL_SIGMA_PX:g} px of noise, landmarks in a room around the trajectory"
+    how = f"{kind} ({tracks}): no image was read{errors}"
     return Sequence(
         name=f"{layout.root.name} (simulated stereo)",
         rig=calibration.rig,
@@ -174,11 +179,8 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         motion=imu,
         provenance=Provenance(
             "euroc",
-            f"{path}: {ALL_SIMULATED if is_simulated(layout.root) else SIMULATED}, seed {seed}",
-            (
-                *(_how_simulated(layout), *choice.facts, calibration.source, calibration.noise_source),
-                *(*calibration.unused, *few_images),
-            ),
+            f"{path}: {kind}, seed {seed}",
+            (how, *choice.facts, calibration.source, calibration.noise_source, *calibration.unused, *few_images),
         ),
         truth=truth,
     )
@@ -284,13 +286,6 @@ def _layout(path: Path) -> _Layout | None:
         return _Layout(mav0.parent if mav0.name == "mav0" else mav0, mav0)
     lean = (path / _STAMPS).is_file() or headings_of(path / _LEAN_IMU) >= set(_GYRO)
     return _Layout(path, None) if lean else None
-
-
-def _how_simulated(layout: _Layout) -> str:
-    tracks = f"{_MAX_TRACKS} a frame, {PIXEL_SIGMA_PX:g} px of noise, landmarks in a room around the trajectory"
-    if is_simulated(layout.root):
-        return f"{ALL_SIMULATED} ({tracks}): no image was read"
-    return f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU"
 
 
 def _tracks_of(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> Observations:

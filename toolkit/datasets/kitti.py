@@ -322,8 +322,9 @@ def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
     t_ns, values, alone = packets
     check_one_clock(layout.root, frames_t_ns, t_ns, "the oxts packets")
     facts = (f"{alone} oxts packets lack their file or their stamp and are left out",) if alone else ()
-    # The world is east, north, up from the first place; the body forward, left, up.
-    R_world_imu, v_world, w_radps = _attitudes(values[:, _ANGLES]), values[:, _EAST_NORTH_UP], values[:, _RATES]
+    # The world is east, north, up from the first place; the body forward, left, up, turned about z, then y, then x.
+    about_x, about_y, about_z = (so3_exp(values[:, _ANGLES][:, i : i + 1] * np.eye(3)[i]) for i in range(3))
+    R_world_imu, v_world, w_radps = about_z @ about_y @ about_x, values[:, _EAST_NORTH_UP], values[:, _RATES]
     stamps, first = np.unique(t_ns, return_index=True)
     truth = Truth(stamps, se3(R_world_imu, _positions(values[:, _PLACE]))[first], v_world[first], independent=False)
     rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(t_ns))))
@@ -442,9 +443,3 @@ def _positions(places: Array) -> Array:
         [scale * longitude, scale * np.log(np.tan(np.pi / 4.0 + latitude / 2.0)), places[:, 2]], axis=1
     )
     return np.asarray(projected - projected[0])
-
-
-def _attitudes(angles: Array) -> Array:
-    """Return rotations (S, 3, 3) of roll, pitch and yaw (S, 3) rad: about z, then y, then x."""
-    about = [so3_exp(angles[:, i : i + 1] * np.eye(3)[i]) for i in range(3)]
-    return np.asarray(about[2] @ about[1] @ about[0])

@@ -22,7 +22,7 @@ from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import GRAVITY_WORLD, ImuNoise, MotionNoise, StereoRig, TwistNoise
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
@@ -130,8 +130,12 @@ def _observations(table: Columns) -> tuple[IntArray, Observations, tuple[str, ..
     # A single row v is that of both images, or of the left one.
     right_px[:, 1] = np.where(np.isnan(right_px[:, 0]) & (rows == ONE_ROW), np.nan, right_px[:, 1])
     if rows == TWO_ROWS:
+        # A right image that is missing may be written as -1, 0 or another number that is no place in an image; the mean
+        # of the rows would hide it. Where the left image has the same value, the whole sighting is missing.
+        u_right, v_right = right_px.T
+        is_filler = (u_right == v_right) & (u_right <= 0.0) & (left_px[:, 0] != u_right)
         # Where only one of uR and vR is given, the right image counts as missing; the left one is used.
-        right_px[_is_filler(left_px, right_px) | np.isnan(right_px).any(axis=1)] = np.nan
+        right_px[is_filler | np.isnan(right_px).any(axis=1)] = np.nan
     corners_px = np.hstack([left_px, right_px])
     if rows == TWO_ROWS:
         check_rows(table.what, corners_px)
@@ -145,15 +149,6 @@ def _observations(table: Columns) -> tuple[IntArray, Observations, tuple[str, ..
     count = int((~seen).sum())
     facts = (f"{count} rows of {table.what} are 0 or -1 in every coordinate: unseen, and left out",) if count else ()
     return frames_t_ns, observations(frame[seen], track_id[seen], corners_px[seen]), facts
-
-
-def _is_filler(left_px: Array, right_px: Array) -> BoolArray:
-    """Say which right images (N, 2) are missing and written as -1, 0 or another number that is no place in an image.
-
-    The mean of the rows would hide it. Where the left image (N, 2) has the same value, the whole sighting is missing.
-    """
-    u_right, v_right = right_px.T
-    return np.asarray((u_right == v_right) & (u_right <= 0.0) & (left_px[:, 0] != u_right))
 
 
 def _motion(

@@ -196,7 +196,12 @@ def _shift(left: Fields, right: Fields) -> tuple[float, tuple[str, ...]]:
 def _of_kalibr(camchain: Path, root: Path, mav0: Path) -> AslCalibration:
     """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
     fields = read_fields(camchain)
-    _check_camchain(fields)
+    if not any(key.startswith("cam1.") for key in fields.arrays):
+        raise DataError(f"{camchain}: holds one camera, and stereo needs two; calibrate cam0 and cam1 together")
+    if "cam0.intrinsics" in fields and "cam0.T_cam_imu" not in fields:
+        remedy = "take the camchain that Kalibr writes when it calibrates cameras and IMU"
+        raise DataError(f"{camchain}: has no cam0.T_cam_imu, so it is of cameras alone; {remedy}")
+    fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
     left, right = (_part(fields, name) for name in ("cam0", "cam1"))
     T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
     mounted = "T_cam_imu" in right
@@ -209,15 +214,6 @@ def _of_kalibr(camchain: Path, root: Path, mav0: Path) -> AslCalibration:
     how = (noise, AS_STATED if stated else NO_NOISE)
     found = _calibration(left, right, (T_imu_left, T_left_right), how, str(camchain.relative_to(root)))
     return replace(found, unused=(*_unused(left, "cam0"), *_unused(right, "cam1"), *unused))
-
-
-def _check_camchain(fields: Fields) -> None:
-    if not any(key.startswith("cam1.") for key in fields.arrays):
-        raise DataError(f"{fields.path}: holds one camera, and stereo needs two; calibrate cam0 and cam1 together")
-    if "cam0.intrinsics" in fields and "cam0.T_cam_imu" not in fields:
-        remedy = "take the camchain that Kalibr writes when it calibrates cameras and IMU"
-        raise DataError(f"{fields.path}: has no cam0.T_cam_imu, so it is of cameras alone; {remedy}")
-    fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
 
 
 def kalibr_noise(*folders: Path) -> tuple[ImuNoise, tuple[str, ...]] | None:

@@ -158,7 +158,7 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | No
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
     # TUM-VI's motion capture, already moved to the IMU and its clock.
-    folders = () if mav0 is None else ("state_groundtruth_estimate0", "mocap0")
+    folders = ("state_groundtruth_estimate0", "mocap0")
     inside = [] if mav0 is None else [mav0 / folder / "data.csv" for folder in folders]
     beside = [
         path for path in sorted(root.glob("*.csv")) if any(headings_of(path) >= set(pose) for pose, _ in _HEADINGS)
@@ -202,7 +202,10 @@ def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
 
     The first is infinite where the two share no two steps.
     """
-    sample_t_ns, gyro_radps = _usable(imu)
+    # Without what the audit will repair: rows that are not finite, out of order, or there twice.
+    finite = np.flatnonzero(np.isfinite(imu.gyro_radps).all(axis=1))
+    sample_t_ns, first = np.unique(imu.t_ns[finite], return_index=True)
+    gyro_radps = imu.gyro_radps[finite[first]]
     within = stamps_among(truth.t_ns, sample_t_ns)
     steps = Steps.of(truth.t_ns[within], _SHORTEST_STEP_NS)
     known = steps.duration_s < _LONGEST_STEP_S
@@ -213,10 +216,3 @@ def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
     off = steps.rates(truth.T_world_imu[within, :3, :3])[known] - measured
     of_gyro, apart = (float(np.sqrt(((x - np.median(x, axis=0)) ** 2).mean())) for x in (measured, off))
     return apart, of_gyro
-
-
-def _usable(imu: ImuSamples) -> tuple[IntArray, Array]:
-    """Return stamps (S,) and rates (S, 3) without what the audit will repair: rows not finite, out of order, twice."""
-    finite = np.flatnonzero(np.isfinite(imu.gyro_radps).all(axis=1))
-    t_ns, first = np.unique(imu.t_ns[finite], return_index=True)
-    return t_ns, imu.gyro_radps[finite[first]]
