@@ -1,7 +1,6 @@
 """What is wrong with a recording is told in one line, and whoever does what it says is not told the same again (10 s).
 
-One table of recordings that are wrong in one thing each; folders of images have one of their own beside it
-(tests/frontend/test_folders.py).
+One table of recordings that are wrong in one thing each.
 """
 
 import gzip
@@ -150,6 +149,11 @@ def pixels(pattern: str, change: Callable[[Any], Any], ending: str = ".png") -> 
     return draw
 
 
+def files(folder: str, content: Callable[[Path], bytes]) -> Step:
+    """Return what writes other bytes into each file of a folder."""
+    return lambda case: [path.write_bytes(content(path)) for path in (case.at / folder).iterdir()]
+
+
 def rolled(case: Case) -> None:
     """Move all rows by ten from pair to pair, as where the camera tilts, and call right images a pair too early."""
     for path in case.at.glob("image_?/*.png"):
@@ -239,6 +243,7 @@ T_LEFT_RIGHT = se3(np.eye(3), np.array([0.4, 0.0, 0.0]))
 PLACES = [np.linalg.matrix_power(T_LEFT_RIGHT, side) for side in (0, 1)]
 TABLES, YAMLS = ([f"mav0/cam{side}/{name}" for side in (0, 1)] for name in ("data.csv", "sensor.yaml"))
 IMAGES = ["mav0/cam0/data", "mav0/cam1/data"]
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 NOISE = "".join(f"{s}_noise_density: 2.0e-3\n{s}_random_walk: 2.0e-4\n" for s in ("gyroscope", "accelerometer"))
 
 
@@ -818,6 +823,21 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             gone(*TABLES),
         ),
         (gone("truth.tum", *IMAGES), "where there are no images; add one of them"),
+        (gone("mav0/imu0/sensor.yaml"), "mav0: missing imu0/sensor.yaml"),
+        (edit(YAMLS[0], "model: pinhole", "model: omni"), "camera_model omni"),
+        (edit(YAMLS[0], "distortion_model: none", "distortion_model: fov"), "distortion_model fov is unknown"),
+        (edit(YAMLS[0], "[250.0, 250.0", "[0.0, 250.0"), "intrinsics 0 250"),
+        (edit(YAMLS[0], "data: [1", "data: [-1"), "a reflection"),
+        (edit(TABLES[0], ",14", ",../14"), "the name of an image"),
+        (lines("mav0/imu0/data.csv", restamped(lambda t: t - 10**17)), "two clocks"),
+        (lines("mav0/imu0/data.csv", restamped(lambda _: START_NS)), "IMU are all of one instant"),
+        (both(gone("mav0/cam1"), check("--tracks", "images")), "cam0/data has images and mav0/cam1/data has none"),
+        (files(IMAGES[0], lambda path: path.read_bytes()[:99]), "image pairs cannot be"),
+        (both(*(files(folder, lambda _: LFS) for folder in IMAGES)), "images with git lfs pull"),
+        (files(IMAGES[1], lambda path: (path.parents[2] / "cam0/data" / path.name).read_bytes()), "are the same ones"),
+        (pixels("mav0/cam?/data/*", lambda image: image * 0), "those of the pair before"),
+        (pixels("mav0/cam1/data/*", lambda image: image[::2, ::2]), "160x100 px, expected 320x200"),
+        (pixels("mav0/cam1/data/*", lambda image: np.roll(image, 25, axis=0)), "the calibration is not that of these"),
         (
             both(lines("truth.tum", of_kilometres), check("--tracks", "simulated")),
             "tracks are simulated in a room; check its unit, or take the tracks of images",

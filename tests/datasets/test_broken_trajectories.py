@@ -1,7 +1,4 @@
-"""One table of files that are wrong in one thing each: every one is refused in one line that names the file and words.
-
-Folders of images have a table of their own beside them (tests/frontend/test_folders.py).
-"""
+"""One table of files that are wrong in one thing each: each is refused in one line that names the file and words."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""ASL folders with images, from end to end: the choice of tracks, what is left out and named, what is refused."""
+"""ASL folders with images, from end to end: the choice of tracks, what is left out and named.
+
+What is refused stands in the table of tests/datasets/test_advice.py.
+"""
 
 import shutil
 from collections.abc import Callable
@@ -107,16 +110,6 @@ def reverse_rows(path: Path) -> None:
     path.write_text("\n".join([head, *rows[::-1]]) + "\n")
 
 
-def one_instant(imu: Path) -> None:
-    head, *rows = imu.read_text().splitlines()
-    stamp = rows[0].partition(",")[0]
-    imu.write_text("\n".join([head, *(f"{stamp},{row.partition(',')[2]}" for row in rows)]) + "\n")
-
-
-def point_to_lfs(path: Path) -> None:
-    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
-
-
 def stalled(root: Path) -> None:
     for camera in (0, 1):
         for path in images(root, camera)[5:8]:
@@ -201,39 +194,6 @@ def test_a_truth_that_turns_otherwise_than_the_gyro_is_reported(asl: Path) -> No
         row[4:] = ["0", "0", f"{np.sin(half_rad):.9f}", f"{np.cos(half_rad):.9f}"]
     (asl / "truth.tum").write_text("".join(f"{' '.join(row)}\n" for row in rows))
     assert stranger()
-
-
-YAML = "mav0/cam{}/sensor.yaml"
-REFUSED: list[tuple[Callable[[Path], object], str]] = [
-    (lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "mav0: missing imu0/sensor.yaml"),
-    (lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
-    (lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
-    (lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
-    (lambda d: edit(d / YAML.format(0), "[0, 0, 1,", "[0, 0, -1,"), "a reflection|not a rotation"),
-    (lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
-    (lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
-    (lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
-    (lambda d: shutil.rmtree(d / "mav0/cam1"), "cam0/data has images and .*cam1/data has none"),
-    (lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "two clocks"),
-    (lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
-    (lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
-    (lambda d: one_instant(d / "mav0/imu0/data.csv"), "IMU are all of one instant"),
-    (lambda d: [point_to_lfs(p) for c in (0, 1) for p in images(d, c)], "images with git lfs pull"),
-    (
-        lambda d: [shutil.copy(a, b) for a, b in zip(images(d, 0), images(d, 1), strict=True)],
-        "left and right images are the same ones",
-    ),
-]
-
-
-@pytest.mark.parametrize(("spoil", "complaint"), REFUSED)
-def test_a_folder_that_cannot_be_used_is_one_clear_line(
-    asl: Path, spoil: Callable[[Path], object], complaint: str
-) -> None:
-    spoil(asl)
-    with pytest.raises(DataError, match=complaint) as raised:
-        load_sequence(str(asl), 0, Frontend(tracks="images"))
-    assert "\n" not in str(raised.value)
 
 
 def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
