@@ -161,16 +161,3 @@ def from_triangle(entries: Array, *, lower: bool = False) -> Array:
     matrices = np.empty((len(entries), size, size))
     matrices[:, rows, columns] = matrices[:, columns, rows] = entries
     return matrices
-
-
-def upper_triangle(matrices: Array) -> Array:
-    """Return the upper triangles (N, d (d + 1) / 2), row by row, of matrices (N, d, d)."""
-    rows, columns = np.triu_indices(matrices.shape[-1])
-    return np.asarray(matrices[:, rows, columns])
-
-
-def with_triangles_apart(orientation: Array, position: Array) -> StatedCovariances:
-    """Return the covariances of two triangles (N, 6), (N, 6), as OpenVINS records them; what couples them is NaN."""
-    values = np.full((len(orientation), 6, 6), np.nan)
-    values[:, :3, :3], values[:, 3:, 3:] = from_triangle(orientation), from_triangle(position)
-    return StatedCovariances(values, OPENVINS)

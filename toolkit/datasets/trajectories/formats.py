@@ -31,8 +31,6 @@ from toolkit.datasets.trajectories.covariances import (
     StatedCovariances,
     from_triangle,
     said_in,
-    upper_triangle,
-    with_triangles_apart,
     written_as,
 )
 from toolkit.datasets.trajectories.headings import Named, is_of_the_globe, named_columns
@@ -312,7 +310,10 @@ class Stamped:
         if not self.covariance:
             return None
         if self.covariance == "apart":
-            return with_triangles_apart(entries[:, :6], entries[:, 6:])
+            # As OpenVINS records them: what couples orientation and position is not stated.
+            values = np.full((len(entries), 6, 6), np.nan)
+            values[:, :3, :3], values[:, 3:, 3:] = from_triangle(entries[:, :6]), from_triangle(entries[:, 6:])
+            return StatedCovariances(values, OPENVINS)
         try:
             convention, lower = said_in(rows.header)
         except DataError as error:
@@ -344,7 +345,8 @@ class Stamped:
         size = STATE if with_covariances.covariance == "state" else 6
         what = "order q p v bg ba; " if size == STATE else ""
         header = f"{self.header}\n# then the upper triangle of a covariance ({size} x {size}) row by row; {what}"
-        values = upper_triangle(written_as(chosen, kept.T_world_imu, kept.cov, size))
+        rows, columns = np.triu_indices(size)
+        values = written_as(chosen, kept.T_world_imu, kept.cov, size)[:, rows, columns]
         return self._text(kept, header + chosen.words, values)
 
     def _text(self, kept: Trajectory, header: str, more: Array) -> str:
