@@ -171,16 +171,6 @@ def test_a_right_image_that_is_missing_leaves_the_sighting_of_the_left_one(
     np.testing.assert_allclose(uv_px[:, [0, 2]], seen.uv_px[:, [0, 2]], rtol=0.0, atol=1e-12)  # v is a mean of two
 
 
-def test_an_empty_cell_of_the_right_image_is_none(tmp_path: Path) -> None:
-    folder = written(recorded("twist"), tmp_path / "own")
-    header, *lines = (folder / "tracks.csv").read_text().splitlines()
-    assert header == "t_ns,track_id,uL,uR,vL,vR"
-    lines[3] = ",".join(cell if column not in (3, 5) else "" for column, cell in enumerate(lines[3].split(",")))
-    (folder / "tracks.csv").write_text("\n".join([header, *lines]))
-    uv_px = own_tables.load(folder).observations.uv_px
-    np.testing.assert_array_equal(is_left_only(uv_px), np.arange(len(uv_px)) == 3)
-
-
 @pytest.mark.parametrize(
     ("kinds", "stamp"),
     [(("acc_", "gyro_"), "timestamp [ns]"), (("a", "w"), "t_ns"), (("linear_acceleration.", "omega_"), "#ns")],
