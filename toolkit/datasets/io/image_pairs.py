@@ -280,14 +280,6 @@ def check_both_cameras(root: Path, left: Path, right: Path) -> None:
         raise DataError(f"{root}: {with_images} has images and {without} has none, {why} {without}")
 
 
-def check_one_trigger(mav0: Path, listed: Listed) -> None:
-    """Raise DataError where no image of cam0 has one of cam1 of the same instant."""
-    if listed.apart_ms is not None:
-        apart = f"no image of cam0 has one of cam1 within 1 ms, the nearest is {listed.apart_ms:.4g} ms away (median)"
-        remedy = "where only the cameras' clocks differ, correct the stamps of cam1"
-        raise DataError(f"{mav0}: {apart}: a stereo pair has one trigger; {remedy}")
-
-
 def check_several_stamps(path: Path, listed: Listed) -> None:
     """Raise DataError, naming the file of the stamps, where there are not two pairs of two instants."""
     if len(listed.pairs) == 1 < listed.stamps:
