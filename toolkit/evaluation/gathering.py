@@ -105,20 +105,18 @@ def _of_folders(given: Iterable[str]) -> _Found:
         name, path = _named(word)
         if not path.is_dir():
             raise DataError(f"{path}: it is no folder; where the truth is a folder, give systems as NAME=FOLDER")
-        systems = {name: path} if name is not None else _systems_in(path)
+        if name is not None:
+            systems = {name: path}
+        else:
+            folders = {printable(folder.name): folder for folder in sorted(path.iterdir()) if folder.is_dir()}
+            systems = {system: folder for system, folder in folders.items() if not system.startswith(".")}
+        if not systems:
+            raise DataError(f"{path}: it has no folders; expected SYSTEM/SEQUENCE.tum or SYSTEM/SEQUENCE/RUN.tum")
         for system, folder in systems.items():
             if system in found:
                 raise DataError(f"{folder}: {system} is given twice; give each system another name")
             found[system] = files_by_sequence(folder)
     return found
-
-
-def _systems_in(tree: Path) -> dict[str, Path]:
-    folders = {printable(path.name): path for path in sorted(tree.iterdir()) if path.is_dir()}
-    systems = {name: path for name, path in folders.items() if not name.startswith(".")}
-    if not systems:
-        raise DataError(f"{tree}: it has no folders; expected SYSTEM/SEQUENCE.tum or SYSTEM/SEQUENCE/RUN.tum")
-    return systems
 
 
 def truths_in(folder: Path) -> dict[str, Path]:
