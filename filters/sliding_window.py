@@ -31,6 +31,7 @@ from toolkit.models.factors import kind_of
 from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import (
     Eliminated,
+    Ending,
     Evaluated,
     ReducedVision,
     RobustCamera,
@@ -62,11 +63,12 @@ WITHOUT = {
     "past poses": {"window.most_states": 1},
 }
 
-# A step that lowers the error by no more than this, half a squared sigma, is the last: it moves nothing by more than a
-# standard deviation. The weights of a robust loss change with every step, so that shorter steps are many.
-_NEGLIGIBLE = 0.5
+# A step that lowers the error by no more than this is the last: it is as short as the last one of every window of the
+# house, in sigmas of all states together. Answers are then half a per cent of a sigma from the minimum; the weights of
+# a robust loss change with every step, so that shorter steps are many.
+_NEGLIGIBLE = 0.5 * Ending.step_sigmas**2
 _MOST_STEPS, _MOST_HALVINGS = 10, 6
-_UNSOLVED = "the last step in the window was longer than one standard deviation; further such windows are not listed"
+_UNSOLVED = "the last step in the window was longer than two standard deviations; further such windows are not listed"
 
 
 def build(setup: Setup) -> Estimator:
@@ -272,9 +274,13 @@ class Equations:
         vector[:poses] += vision.vector
         if left is not None and tried.H is not None:
             of_left, vector_left = tried.H.carry(left.information, left.vector - left.information @ tried.off)
-            rows = np.r_[:6, poses : poses + d - 6, first : first + 3 * len(left.track_ids)]
-            information[np.ix_(rows, rows)] += of_left
-            vector[rows] += vector_left
+            size = len(vector_left)
+            parts = (0, 0, 6), (poses, 6, d), (first, d, size)
+            spans = [(slice(start, start + end - begin), slice(begin, end)) for start, begin, end in parts]
+            for rows, of_rows in spans:
+                vector[rows] += vector_left[of_rows]
+                for columns, of_columns in spans:
+                    information[rows, columns] += of_left[of_rows, of_columns]
         return cls(information, vector, places, between, vision, tied)
 
     @cached_property

@@ -6,8 +6,9 @@ prediction may be off by many sigmas of a sighting's innovation, and linearised 
 the weight of an outlier.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -29,15 +30,25 @@ from toolkit.models.state import Belief
 class GraphExtension:
     """New factors and values, and every state and landmark they involve.
 
-    ``motion`` are the factors that are no sightings, ``seen`` the sightings.
+    ``motion`` are the factors that are no sightings, ``seen`` the sightings and ``stereo`` their factors, which are
+    made when they are asked for.
     """
 
     motion: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     seen: StereoFrame | None = None
-    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    stereo: Iterable[gtsam.NonlinearFactor] = ()
     values: gtsam.Values = field(default_factory=gtsam.Values)
     state_keys: list[int] = field(default_factory=list)
     landmark_ids: list[int] = field(default_factory=list)
+
+    @cached_property
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """All new factors."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(self.motion)
+        for factor in self.stereo:
+            graph.add(factor)
+        return graph
 
 
 class GraphBuilder:
@@ -59,7 +70,6 @@ class GraphBuilder:
         """Return what a packet adds; the new state is predicted from the latest one."""
         extension = GraphExtension()
         expected = self._add_state(packet, extension)
-        extension.factors.push_back(extension.motion)
         there, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks)
         if self._begins_there:
             self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
@@ -114,7 +124,6 @@ class GraphBuilder:
         placed = dict(zip(new.track_ids.tolist(), points, strict=True))
         for track_id, point in placed.items():
             extension.values.insert(L(track_id), point)
-        for factor in self._stereo.of(used, k):
-            extension.factors.add(factor)
-        extension.seen, extension.landmark_ids = used, used.track_ids.tolist()
+        extension.seen, extension.stereo = used, self._stereo.of(used, k)
+        extension.landmark_ids = used.track_ids.tolist()
         self._landmarks.see(used, placed, self.belief.T_world_imu)

@@ -57,7 +57,7 @@ def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_step
     sequence = simulate(replace(DRIVE, duration_s=0.6), 0)
     done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
     assert done.status == "ok"
-    assert sum("longer than one standard deviation" in line for line in done.log) == told
+    assert sum("longer than two standard deviations" in line for line in done.log) == told
 
 
 def test_a_gaussian_that_is_not_determined_cannot_lose_its_cross_covariances_and_says_so():
