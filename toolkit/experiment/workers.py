@@ -40,7 +40,13 @@ Work = Callable[[T, Progress], R]
 Needs = Callable[[T], Hashable]
 
 # Loky takes growth by 300 MB for a leak and restarts the process; a recording and a smoother's graph are no leak.
-_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
+# glibc returns every array of a few hundred kB to the system and has its pages cleared for the next one: a tenth of the
+# time of dense algebra. Elsewhere the two variables say nothing.
+_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {
+    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30),
+    "MALLOC_MMAP_THRESHOLD_": str(8 * 2**20),
+    "MALLOC_TRIM_THRESHOLD_": str(64 * 2**20),
+}
 _PARENT_POLL_S, _POLL_S = 1.0, 0.1
 # How many processors this process may use: by its affinity, and by the limits of its container.
 usable_cpus: Callable[[], int] = cpu_count
