@@ -75,7 +75,11 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor, f
     names = sorted({name for case in cases for name in case.estimators})
     timed = list[TimedPairs]()
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
-        there, here = _estimators_of(version, sides, names)
+        known_to = [side.request("where", estimators=names) for side in sides]
+        if known_to[0] == known_to[1]:
+            here_too = known_to[0]["toolkit"]
+            raise BaselineError(f"{version} does not contain the code that runs here ({here_too}); name another")
+        there, here = ({name for name in names if side["files"][name] is not None} for side in known_to)
         if new := [name for name in names if name not in there]:
             found.notes.append(f"{', '.join(new)}: not in {version}, and not timed")
         for case in cases:
@@ -166,10 +170,12 @@ def timers(*paths: Sequence[Path]) -> Iterator[tuple[Process, ...]]:
     """Start a process for each version, whose path stands first in it; none is left when the context ends."""
     with ExitStack() as stack:
         started = []
+        single = dict.fromkeys(THREAD_VARIABLES, "1")
+        before = [value] if (value := os.environ.get("PYTHONPATH")) else []
         for what, path in zip(("the other version", "this version"), paths, strict=True):
             process = subprocess.Popen(
                 [sys.executable, "-P", timing_child.__file__],
-                env=_environment(path),
+                env={**os.environ, **single, "PYTHONPATH": os.pathsep.join([*map(str, path), *before])},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -180,22 +186,9 @@ def timers(*paths: Sequence[Path]) -> Iterator[tuple[Process, ...]]:
         yield tuple(started)
 
 
-def _environment(path: Sequence[Path]) -> dict[str, str]:
-    single = dict.fromkeys(THREAD_VARIABLES, "1")
-    before = os.environ.get("PYTHONPATH")
-    return {**os.environ, **single, "PYTHONPATH": os.pathsep.join([*map(str, path), *([before] if before else [])])}
-
-
 def _end(process: "subprocess.Popen[str]") -> None:
     process.kill()
     process.communicate()
-
-
-def _estimators_of(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[set[str]]:
-    found = [side.request("where", estimators=names) for side in sides]
-    if found[0] == found[1]:
-        raise BaselineError(f"{version} does not contain the code that runs here ({found[0]['toolkit']}); name another")
-    return [{name for name in names if side["files"][name] is not None} for side in found]
 
 
 def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
