@@ -14,7 +14,7 @@ less, by sqrt(1 - r^2) (Pitman, "A note on normal correlation", Biometrika 31, 1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -99,7 +99,9 @@ def contests_of(rows: Sequence[Row], sequence: Recorded) -> tuple[Contest, ...]:
 
     Only rows that ended well under every seed take part, and that answered for as much as the best one.
     """
-    able = list(_able(rows))
+    good = [row for row in rows if row.answered and row.counts["ok"] == len(row.outcomes)]
+    most = max((row.value(COVERAGE) or 0.0 for row in good), default=0.0)
+    able = [row for row in good if (row.value(COVERAGE) or 0.0) >= most - _COVERAGE_MARGIN_PERCENT]
     key = accuracy_of(able)
     over_seeds = any(len(row.outcomes) > 1 for row in able)
     test_drift, test_tracks = (_over_seeds(key), _over_seeds(HELD_OUT)) if over_seeds else _of_one_run(sequence)
@@ -119,12 +121,6 @@ def cheaper_near(contest: Contest, within: float, saves: float) -> Row | None:
     near = [row for row in contest.rows[1:] if (row.value(contest.metric) or np.inf) <= limit and row.value(COST)]
     best = min(near, key=lambda row: row.value(COST) or np.inf, default=None)
     return best if best is not None and (best.value(COST) or np.inf) <= most else None
-
-
-def _able(rows: Sequence[Row]) -> Iterator[Row]:
-    good = [row for row in rows if row.answered and row.counts["ok"] == len(row.outcomes)]
-    most = max((row.value(COVERAGE) or 0.0 for row in good), default=0.0)
-    yield from (row for row in good if (row.value(COVERAGE) or 0.0) >= most - _COVERAGE_MARGIN_PERCENT)
 
 
 def accuracy_of(rows: Iterable[Row]) -> str:
