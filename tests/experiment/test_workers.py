@@ -209,7 +209,7 @@ def test_progress_is_that_of_all_units_and_never_goes_back(jobs, work, workers):
     assert shares[-1] == 1.0 or workers == 1
 
 
-def test_a_stage_before_the_first_frame_is_no_half_of_a_run() -> None:
+def test_a_stage_before_the_first_frame_is_no_half_of_a_run_and_a_second_solve_undoes_nothing() -> None:
     """As while an estimator compiles; a stage after the frames is a smoother's solve, the second half."""
     received: list[tuple[int, int, str]] = []
 
@@ -221,9 +221,12 @@ def test_a_stage_before_the_first_frame_is_no_half_of_a_run() -> None:
         progress.advance(0, 1, "compiling")
         progress.advance(1, 2)
         progress.advance(0, 9, "solving")
+        progress.advance(9, 9, "solving")
+        progress.advance(0, 9, "solving anew")
 
     list(results_of([0], 1, works, Listening()))
-    assert received == [(0, 100, "compiling"), (25, 100, ""), (50, 100, "solving, iteration 1")]
+    assert received[:3] == [(0, 100, "compiling"), (25, 100, ""), (50, 100, "solving, iteration 1")]
+    assert received[3:] == [(100, 100, "solving, iteration 10"), (100, 100, "solving anew, iteration 1")]
 
 
 def test_no_process_outlives_one_that_is_killed(tmp_path, starts_group):

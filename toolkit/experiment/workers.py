@@ -299,19 +299,23 @@ class _Board:
     def __init__(self, count: int, path: Path | None = None) -> None:
         size, self._total = max(count, 1), _STEPS * count
         self.entries = np.zeros(size, _ENTRY) if path is None else np.memmap(path, _ENTRY, "w+", shape=(size,))
-        self._under_way = np.ones(count, dtype=bool)
+        self._under_way, self._most = np.ones(count, dtype=bool), 0
 
     def finish(self, place: int) -> None:
         self._under_way[place] = False
 
     def progress(self) -> tuple[int, int, str]:
-        """Return the steps done, of how many, and the current stage of the first unit that is in one."""
+        """Return the steps done, of how many, and the current stage of the first unit that is in one.
+
+        A unit that solves anew does not undo what was done: fewer steps than before would begin another count.
+        """
         entries, half = np.array(self.entries[: self._under_way.size])[self._under_way], _STEPS // 2
         done = half * entries["done"] // np.maximum(entries["total"], 1) + half * entries["solving"]
         stage = ""
         for one in entries[entries["stage"] != b""][:1]:
             stage = one["stage"].decode() + (f", iteration {one['done'] + 1}" if one["solving"] else "")
-        return self._total - _STEPS * entries.size + int(done.sum()), self._total, stage
+        self._most = max(self._most, self._total - _STEPS * entries.size + int(done.sum()))
+        return self._most, self._total, stage
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
