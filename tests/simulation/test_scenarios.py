@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.datasets import simulated
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import CHANNELS, disparity_px
 from toolkit.sequence import check_runnable
@@ -89,6 +90,10 @@ def test_tracks_live_as_long_as_a_real_trackers_do(scenario: Scenario) -> None:
     lives = np.bincount(simulate(scenario, 0).observations.track_id)
     low, high = (15.0, 35.0) if scenario is FLIGHT else (8.0, 16.0)
     assert low < lives.mean() < high
+
+
+def test_five_scenarios_are_recordings_by_name() -> None:
+    assert set(simulated.BUILT_IN) == {"drive", "drive-imu", "flight", "drive-realistic", "flight-realistic"}
 
 
 @pytest.mark.parametrize(
