@@ -266,8 +266,7 @@ def _corrected(joint: JointBelief, root: Array, matrix_root: Array, vector: Arra
     """Return the present state given an information matrix L and a vector n (6 W,) on errors u of the clones.
 
     The errors of the clones, newest first, are R u, with R the root of their covariance; ``matrix_root`` is that of
-    1 + L. With
-    ``Y = R^-1 P_cx`` the update moves the state's error by ``Y^T (1 + L)^-1 n`` and its covariance becomes
+    1 + L. With ``Y = R^-1 P_cx`` the update moves the state's error by ``Y^T (1 + L)^-1 n`` and its covariance becomes
     ``P_xx - Y^T Y + Y^T (1 + L)^-1 Y``.
     """
     core = joint.core
