@@ -36,7 +36,7 @@ SEQUENCES = (
 )  # fmt: skip
 ESTIMATORS = (
     "dead-reckoning", "mapping", "seed-ekf", "ekf", "iekf", "riekf", "ekf-slam",
-    "msckf", "msckf-fej", "msckf-slam", "smart", "fixed-lag", "isam2", "batch",
+    "msckf", "msckf-fej", "msckf-slam", "smart", "sliding-window", "fixed-lag", "isam2", "batch",
 )  # fmt: skip
 INPUT = "(input)"
 Answers = dict[str, Any]
