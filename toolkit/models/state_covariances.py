@@ -43,6 +43,7 @@ _STANDING = 150
 # A direction of a variable with less than this share of the information on its best direction is lost in double
 # precision: for instance the depth of a landmark beyond 1e10 baselines.
 _LEAST_DETERMINED = 1e-10
+_dissected = gtsam.Ordering.MetisGaussianFactorGraph
 
 
 class RoundingError(RuntimeError):
@@ -55,41 +56,27 @@ def state_covs(linear: gtsam.GaussianFactorGraph, motion: MotionModel, poses: Ar
     ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them, and
     RoundingError.
     """
-    return covs_beside(linear, motion, poses, ())[0]
-
-
-def covs_beside(
-    linear: gtsam.GaussianFactorGraph, motion: MotionModel, poses: Array, beside: Sequence[int]
-) -> tuple[Array, Array]:
-    """Return the covariances of the states as :func:`state_covs`, and (m, m) of the variables beside them.
-
-    These variables belong to no frame, like the scale of disparities; they are eliminated after all states.
-    """
     states, has_velocity = [motion.keys(k) for k in range(len(poses))], "v" in motion.variable_sizes
     try:
-        covs = _of_groups(linear, states, beside, has_velocity)
+        covs = _of_states(linear, states, has_velocity)
     except RuntimeError:
-        kept = {key for group in (*states, beside) for key in group}
-        covs = _of_groups(_with_orthonormal_landmarks(linear, kept), states, beside, has_velocity)
-    of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
-    return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
+        kept = {key for state in states for key in state}
+        covs = _of_states(_with_orthonormal_landmarks(linear, kept), states, has_velocity)
+    return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
 
 
-def _of_groups(
-    linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], beside: Sequence[int], has_velocity: bool
-) -> list[Array]:
-    """Return the joint covariance of the variables of each state, and of those beside them if there are any."""
-    together: Sequence[Sequence[int]] = [*states, beside] if beside else states
-    tied = _with_groups_connected(linear, together)
+def _of_states(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], has_velocity: bool) -> list[Array]:
+    """Return the joint covariance of the variables of each state."""
+    tied = _with_states_connected(linear, states)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
-    spans = _spans(tied, together)
-    in_time = partial(_in_time, tied, together, spans), some[:1]
-    dissected = partial(_dissected, tied, beside), some
+    spans = _spans(tied, states)
+    in_time = partial(_in_time, tied, states, spans), some[:1]
+    dissected = partial(_dissected, tied), some
     holds_in_time = has_velocity or any(last - first > _STANDING for first, last in spans.values())
     for order, checked in (in_time, dissected) if holds_in_time else (dissected, in_time):
         try:
-            covs = _recovered(_eliminated(tied, order(), together), together)
+            covs = _recovered(_eliminated(tied, order(), states), states)
             pairs = zip(checked, _variances(linear, [states[k] for k in checked]), strict=True)
             if all(np.allclose(np.diag(covs[k]), known, rtol=2.0 * _MOST_ROUNDED, atol=0.0) for k, known in pairs):
                 return covs
@@ -147,14 +134,14 @@ def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -
     return np.split(np.diag(np.linalg.inv(information)), ends[:-1])
 
 
-def _with_groups_connected(
-    linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]
+def _with_states_connected(
+    linear: gtsam.GaussianFactorGraph, states: Iterable[Sequence[int]]
 ) -> gtsam.GaussianFactorGraph:
-    """Return the graph with added factors of zero information that connect the variables of each group."""
+    """Return the graph with added factors of zero information that connect the variables of each state."""
     graph, sizes = gtsam.GaussianFactorGraph(), linear.gradientAtZero()
     graph.push_back(linear)
     unit = gtsam.noiseModel.Unit.Create(1)
-    for first, *others in together:
+    for first, *others in states:
         for other in others:
             nothing = [np.zeros((1, sizes.at(key).size)) for key in (first, other)]
             graph.add(gtsam.JacobianFactor(first, nothing[0], other, nothing[1], np.zeros(1), unit))
@@ -162,47 +149,42 @@ def _with_groups_connected(
 
 
 def _in_time(
-    graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]], spans: Mapping[int, tuple[int, int]]
+    graph: gtsam.GaussianFactorGraph, states: Sequence[Sequence[int]], spans: Mapping[int, tuple[int, int]]
 ) -> gtsam.Ordering:
-    """Return the order of the groups as given, after all variables in no group: the landmarks.
+    """Return the order of the states as given, after the landmarks.
 
     Eliminating a landmark leaves a dense factor on all states that saw it. A landmark seen for long, as while a vehicle
     stands, is eliminated after the last of these states and until then is in the clique of each: some hundred rows
     instead of thousands.
     """
-    landmarks = _others(gtsam.Ordering.ColamdGaussianFactorGraph(graph), {key for group in groups for key in group})
+    landmarks = _others(gtsam.Ordering.ColamdGaussianFactorGraph(graph), {key for state in states for key in state})
     waiting = {key: last for key, (first, last) in spans.items() if last - first > _MOST_TIED}
     before = defaultdict[int, list[int]](list)
     for key, last in waiting.items():
         before[last].append(key)
-    in_groups = [key for i, group in enumerate(groups) for key in (*before[i], *group)]
-    return ordering_of([*(key for key in landmarks if key not in waiting), *in_groups])
+    in_states = [key for i, state in enumerate(states) for key in (*before[i], *state)]
+    return ordering_of([*(key for key in landmarks if key not in waiting), *in_states])
 
 
-def _spans(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) -> dict[int, tuple[int, int]]:
-    """Return the first and the last group with which each variable outside all groups shares a factor."""
-    place = {key: i for i, group in enumerate(groups) for key in group}
+def _spans(graph: gtsam.GaussianFactorGraph, states: Sequence[Sequence[int]]) -> dict[int, tuple[int, int]]:
+    """Return the first and the last state with which each landmark shares a factor."""
+    place = {key: i for i, state in enumerate(states) for key in state}
     # As arrays: a long recording has a hundred thousand factors.
     count = graph.size()
     keys = np.fromiter(chain.from_iterable(graph.at(i).keys() for i in range(count)), np.int64)
     factor = np.repeat(np.arange(count), [graph.at(i).size() for i in range(count)])
     different, row = np.unique(keys, return_inverse=True)
-    group_of = np.array([place.get(key, -1) for key in different.tolist()])[row]
-    inside = group_of >= 0
-    low, high = np.full(count, len(groups)), np.full(count, -1)
-    np.minimum.at(low, factor[inside], group_of[inside])
-    np.maximum.at(high, factor[inside], group_of[inside])
+    state_of = np.array([place.get(key, -1) for key in different.tolist()])[row]
+    inside = state_of >= 0
+    low, high = np.full(count, len(states)), np.full(count, -1)
+    np.minimum.at(low, factor[inside], state_of[inside])
+    np.maximum.at(high, factor[inside], state_of[inside])
     shared = ~inside & (high[factor] >= 0)
     others, row = np.unique(keys[shared], return_inverse=True)
-    first, last = np.full(others.size, len(groups)), np.full(others.size, -1)
+    first, last = np.full(others.size, len(states)), np.full(others.size, -1)
     np.minimum.at(first, row, low[factor[shared]])
     np.maximum.at(last, row, high[factor[shared]])
     return dict(zip(others.tolist(), zip(first.tolist(), last.tolist(), strict=True), strict=True))
-
-
-def _dissected(graph: gtsam.GaussianFactorGraph, last: Collection[int]) -> gtsam.Ordering:
-    """Return the order of nested dissection, with some variables last."""
-    return ordering_of([*_others(gtsam.Ordering.MetisGaussianFactorGraph(graph), last), *last])
 
 
 def _others(ordering: gtsam.Ordering, without: Collection[int]) -> list[int]:
@@ -211,14 +193,14 @@ def _others(ordering: gtsam.Ordering, without: Collection[int]) -> list[int]:
 
 
 def _eliminated(
-    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, together: Iterable[Sequence[int]]
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, states: Iterable[Sequence[int]]
 ) -> list[gtsam.GaussianConditional]:
-    """Return the conditionals on later variables, in the order of elimination, of groups and of what these depend on.
+    """Return the conditionals on later variables, in the order of elimination, of states and of what these depend on.
 
     Those of the other variables, landmarks mostly, are not kept: of a minute indoors they are 150 MB.
     """
     net, kept = graph.eliminateSequential(ordering), list[gtsam.GaussianConditional]()
-    needed = {key for group in together for key in group}
+    needed = {key for state in states for key in state}
     for conditional in (net.at(i) for i in range(net.size())):
         if conditional.firstFrontalKey() in needed:
             needed.update(conditional.keys())
@@ -298,24 +280,24 @@ def _together(rows: Mapping[int, range], keys: Iterable[int]) -> list[int]:
     return [row for key in keys for row in rows[key]]
 
 
-def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence[Sequence[int]]) -> list[Array]:
-    """Return the joint covariance of each group of variables, from the conditionals in the order of elimination."""
+def _recovered(conditionals: list[gtsam.GaussianConditional], states: Sequence[Sequence[int]]) -> list[Array]:
+    """Return the joint covariance of the variables of each state, from the conditionals in the order of elimination."""
     place = {one.firstFrontalKey(): i for i, one in enumerate(conditionals)}
     cliques = _cliques(conditionals)
     clique_of = {key: i for i, clique in enumerate(cliques) for key in clique.sizes}
     # The first variable that a clique depends on depends itself on all the others.
     next_of = [clique_of[min(one.later, key=place.__getitem__)] if one.later else None for one in cliques]
-    groups = defaultdict[int, list[Sequence[int]]](list)
-    for group in together:
-        groups[clique_of[min(group, key=place.__getitem__)]].append(group)
+    states_of = defaultdict[int, list[Sequence[int]]](list)
+    for state in states:
+        states_of[clique_of[min(state, key=place.__getitem__)]].append(state)
     joints, waiting, covs = dict[int | None, _Joint](), Counter(next_of), dict[int, Array]()
     joints[None] = _Joint({}, np.empty((0, 0)))
     for i in reversed(range(len(cliques))):
         joint = joints[next_of[i]].extended(cliques[i])
-        covs |= {group[0]: joint.of(group) for group in groups[i]}
+        covs |= {state[0]: joint.of(state) for state in states_of[i]}
         if waiting[i]:
             joints[i] = joint
         waiting[next_of[i]] -= 1
         if not waiting[next_of[i]]:
             del joints[next_of[i]]
-    return [covs[group[0]] for group in together]
+    return [covs[state[0]] for state in states]
