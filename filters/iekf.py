@@ -89,15 +89,16 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     if not len(joint.landmark_ids):
         return
     seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
-    measurement = Measurement(joint, frame, at, rig, joint_landmarks.weighed(joint, seen, gate))
-    if not measurement.weights.any():
+    weights = joint_landmarks.weighed(joint, seen, joint_landmarks.covs_with_state(joint, seen), gate)
+    if not weights.any():
         return
+    measurement = Measurement(joint, frame, at, rig, weights)
     best, converged = most_probable(measurement)
     gate.unconverged += not converged
     if converged or best.pull.any():
         joint.move(best.delta)
-        H, _ = measurement.stacked(best.seen)
-        joint.reduce_covariance(H, joint_landmarks.columns(joint))
+        cross_covs = joint_landmarks.covs_with_state(joint, best.seen)
+        joint.reduce_covariance(*joint_landmarks.innovation(joint, best.seen, cross_covs, weights)[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,37 +111,46 @@ class Measurement:
     rig: StereoRig
     weights: Array
 
+    @property
+    def part(self) -> slice:
+        """Return the columns of the k errors that a sighting depends on: those of landmarks and clones."""
+        return slice(self.prediction.landmark_columns.start, self.prediction.cov.shape[0])
+
     def after(self, pull: Array) -> Iterate:
         """Return the correction that a pull (k,) yields."""
-        delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
+        delta = self.prediction.cov[:, self.part] @ pull
         seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
-        prior = delta[joint_landmarks.columns(self.prediction)] @ pull
+        prior = delta[self.part] @ pull
         in_front = (seen.depth_m[self.weights > 0.0] > 0.0).all()
         cost = float(prior + self.weights @ np.square(seen.residuals).sum(axis=1)) if in_front else np.inf
         return Iterate(delta, pull, seen, cost)
 
     def step(self, now: Iterate) -> PullStep:
         """Return the step to the minimum of the cost linearised at an iterate."""
-        part = joint_landmarks.columns(self.prediction)
-        P = self.prediction.cov[part, part]
+        P = self.prediction.cov[self.part, self.part]
         H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
         H, residuals = self.stacked(now.seen._replace(H_pose=H_pose, H_point=H_point))
         carried = H @ P
         innovation_cov = H @ carried.T
         innovation_cov.flat[:: len(carried) + 1] += 1.0
-        pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[part]) - now.pull
+        pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[self.part]) - now.pull
         # |step|^2 in the metric P^-1 + H^T H
         return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
 
     def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks with non-zero weight, stacked."""
-        return joint_landmarks.stacked(self.prediction, seen, self.weights)
+        rows, roots = np.flatnonzero(self.weights), np.sqrt(self.weights[self.weights > 0.0])[:, None, None]
+        k = self.part.stop - self.part.start
+        own = np.concatenate([3 * rows[:, None] + np.arange(3), np.tile(np.arange(k - 6, k), (len(rows), 1))], axis=1)
+        blocks = roots * np.concatenate([seen.H_point[rows], seen.H_pose[rows]], axis=2)
+        places, ends = np.repeat(own, 3, axis=0).ravel(), np.arange(0, blocks.size + 1, 9)
+        H = csr_array((blocks.ravel(), places, ends), (3 * len(rows), k))
+        return H, (roots[..., 0] * seen.residuals[rows]).ravel()
 
 
 def most_probable(measurement: Measurement) -> IterationResult:
     """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
-    part = joint_landmarks.columns(measurement.prediction)
-    now = measurement.after(np.zeros(part.stop - part.start))
+    now = measurement.after(np.zeros(measurement.part.stop - measurement.part.start))
     for _ in range(MOST_STEPS):
         step = measurement.step(now)
         if step.length < NEGLIGIBLE_STEP:

@@ -15,7 +15,6 @@ from typing import Self
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
-from scipy.sparse import csr_array
 
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
@@ -28,10 +27,6 @@ from toolkit.settings import Scalar
 # At least this share of each variance is assumed independent of all other errors. A smaller share is lost in rounding,
 # and without it the covariance of two clones of one pose, equal to sixteen digits, has no Cholesky root.
 _LEAST_INDEPENDENT = 1e-12
-
-
-# A matrix (m, k) that is multiplied from the left.
-Jacobian = Array | csr_array
 
 
 class JointBelief:
@@ -119,15 +114,9 @@ class JointBelief:
         self.points = np.concatenate([self.points, points])
         self.first_points = np.concatenate([self.first_points, points])
 
-    def update(self, H: Jacobian, residual: Array, columns: slice) -> None:
-        """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to ``columns`` of the error state."""
-        self.update_carried(*self._carried_innovation(H, columns), residual)
-
-    def update_carried(self, carried: Array, innovation_cov: Array, residual: Array) -> None:
+    def update(self, carried: Array, innovation_cov: Array, residual: Array) -> None:
         """Correct the whole state by whitened residuals (m,), given H P (m, n) and H P H^T + 1 (m, m), overwritten."""
-        root = cholesky_root(innovation_cov)
-        half_gain = divided_by_root(root, carried)
-        self._reduce(half_gain)
+        root, half_gain = self.reduce_covariance(carried, innovation_cov)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
     def inform(self, blocks: Array, taken: Array, vector: Array) -> None:
@@ -149,22 +138,17 @@ class JointBelief:
         self._cov[:first, :first] += others
         self.move(half_gain.T @ divided_by_root(matrix_root, (root.T @ vector)[:, None])[:, 0])
 
-    def reduce_covariance(self, H: Jacobian, columns: slice) -> None:
-        """Reduce the covariance by whitened measurements with Jacobian (m, k); the estimates stay."""
-        carried, innovation_cov = self._carried_innovation(H, columns)
-        self._reduce(divided_by_root(cholesky_root(innovation_cov), carried))
+    def reduce_covariance(self, carried: Array, innovation_cov: Array) -> tuple[Array, Array]:
+        """Reduce the covariance by whitened measurements, given as to :meth:`update`; the estimates stay.
 
-    def _reduce(self, half_gain: Array) -> None:
+        Return the lower root of the innovations' covariance (m, m), and H P divided by it.
+        """
+        root = cholesky_root(innovation_cov)
+        half_gain = divided_by_root(root, carried)
         # NumPy's product of a matrix with its own transpose is exactly symmetric.
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
-
-    def _carried_innovation(self, H: Jacobian, columns: slice) -> tuple[Array, Array]:
-        """Return H P and the innovations' covariance H P H^T + 1."""
-        carried = np.asarray(H @ self._cov[columns])
-        innovation_cov = np.asarray(H @ carried[:, columns].T)
-        innovation_cov.flat[:: len(carried) + 1] += 1.0
-        return carried, innovation_cov
+        return root, half_gain
 
     def move(self, delta: Array) -> None:
         """Move every estimate by an error (n,); first estimates stay."""

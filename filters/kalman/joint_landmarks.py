@@ -6,7 +6,6 @@ It uses the newest clone, whose estimate and covariance are those of the present
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from filters.kalman.joint import JointBelief, Linearisation
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
@@ -34,10 +33,10 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     if not len(joint.landmark_ids):
         return
     seen = linearise_sightings(joint, frame, at, rig)
-    weights = weighed(joint, seen, gate)
+    cross_covs = covs_with_state(joint, seen)
+    weights = weighed(joint, seen, cross_covs, gate)
     if weights.any():
-        H, residuals = stacked(joint, seen, weights)
-        joint.update(H, residuals, columns(joint))
+        joint.update(*innovation(joint, seen, cross_covs, weights))
 
 
 def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
@@ -52,39 +51,33 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     return LandmarkSightings(residuals, H_pose, H_point, depth_m, stereo.degrees_of_freedom(uvs_px))
 
 
-def stacked(joint: JointBelief, seen: LandmarkSightings, weights: Array) -> tuple[csr_array, Array]:
-    """Return Jacobian (m, k) and residuals (m,) of the landmarks whose weight (L,) is not zero, stacked.
-
-    The columns are the k errors of landmarks and clones, of which a sighting depends on its landmark's and on those of
-    the newest clone.
-    """
-    rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])[:, None, None]
-    k = 3 * len(weights) + 6 * len(joint.clones)
-    own = np.concatenate([3 * rows[:, None] + np.arange(3), np.tile(np.arange(k - 6, k), (len(rows), 1))], axis=1)
-    blocks = roots * np.concatenate([seen.H_point[rows], seen.H_pose[rows]], axis=2)
-    places, ends = np.repeat(own, 3, axis=0).ravel(), np.arange(0, blocks.size + 1, 9)
-    return csr_array((blocks.ravel(), places, ends), (3 * len(rows), k)), (roots[..., 0] * seen.residuals[rows]).ravel()
+def covs_with_state(joint: JointBelief, seen: LandmarkSightings) -> Array:
+    """Return the covariances H P (L, 3, n) of sightings with the whole state."""
+    P = joint.cov
+    by_point = seen.H_point @ P[joint.landmark_columns].reshape(-1, 3, len(P))
+    return np.asarray(by_point + (seen.H_pose.reshape(-1, 6) @ P[-6:]).reshape(by_point.shape))
 
 
-def columns(joint: JointBelief) -> slice:
-    """Return the columns of the error state that :func:`stacked` has: those of landmarks and clones."""
-    return slice(joint.landmark_columns.start, joint.cov.shape[0])
-
-
-def weighed(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> Array:
+def weighed(joint: JointBelief, seen: LandmarkSightings, cross_covs: Array, gate: FrameGate) -> Array:
     """Return the weights of landmarks (L,): 0 unless in front of the camera with residuals that pass the gate.
 
     The projection formula gives a point behind the camera an image too, which may even match the measured one.
     """
-    H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
-    predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
-    nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
+    each = np.arange(len(cross_covs))
+    own = cross_covs[:, :, joint.landmark_columns].reshape(each.size, 3, each.size, 3)[each, :, each]
+    covs = own @ seen.H_point.mT + cross_covs[:, :, -6:] @ seen.H_pose.mT + np.eye(3)
+    nis = mahalanobis_squared(seen.residuals, covs)
     return gate.weights(nis, seen.dof, gate.accepts(nis, seen.dof, seen.depth_m > 0.0))
 
 
-def _pose_and_landmark_cov(joint: JointBelief) -> Array:
-    """Return the covariance (L, 9, 9) of the newest clone and each landmark."""
-    newest = np.arange(joint.clone_columns.stop - 6, joint.clone_columns.stop)
-    own = np.arange(joint.landmark_columns.start, joint.landmark_columns.stop).reshape(-1, 3)
-    rows = np.concatenate([np.tile(newest, (len(own), 1)), own], axis=1)
-    return np.asarray(joint.cov[rows[:, :, None], rows[:, None, :]])
+def innovation(
+    joint: JointBelief, seen: LandmarkSightings, cross_covs: Array, weights: Array
+) -> tuple[Array, Array, Array]:
+    """Return H P (m, n), H P H^T + 1 (m, m) and residuals (m,) of the landmarks whose weight (L,) is not zero."""
+    rows = np.flatnonzero(weights)
+    roots, m = np.sqrt(weights[rows])[:, None, None], 3 * rows.size
+    H_pose, H_point = roots * seen.H_pose[rows], roots * seen.H_point[rows]
+    cross = (roots * cross_covs[rows]).reshape(m, -1)
+    of_points = cross[:, joint.landmark_columns].reshape(m, -1, 3)[:, rows].swapaxes(0, 1) @ H_point.mT
+    cov = of_points.swapaxes(0, 1).reshape(m, m) + cross[:, -6:] @ H_pose.reshape(m, 6).T + np.eye(m)
+    return cross, cov, (roots[..., 0] * seen.residuals[rows]).ravel()

@@ -34,8 +34,6 @@ LEAST_RAY = 1e-6
 Arrays = tuple[Any, ...]
 _ROW, _MATRIX, _STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 _MASK = types.boolean[:, ::1]
-# Ids (S,) and sightings (S, 3) of a frame, which may be read-only.
-_IDS, _SIGHTINGS = types.Array(types.int64, 1, "C", readonly=True), types.Array(types.float64, 2, "C", readonly=True)
 # T_world_imu (W, 4, 4) of the window's poses, at present and where Jacobians are evaluated.
 _WINDOW = types.Tuple((_STACK, _STACK))
 # fx, fy, cx, cy px and baseline m (5,); the whiteners (3, 3) of sightings in both images and in the left one alone;
@@ -603,57 +601,6 @@ def start_landmark(sightings: Arrays, points: Array, f: int, where: IntArray, he
 _TRACKS = types.Tuple((_STACK, _MASK, _MATRIX, _MATRIX))
 
 
-@kernel(types.int64[::1], _TRACKS, types.int64[::1], _IDS, _SIGHTINGS)
-def with_frame(
-    track_ids: IntArray, tracks: Arrays, ascending: IntArray, frame_ids: IntArray, frame_uvs_px: Array
-) -> tuple[IntArray, Array, BoolArray, Array, Array]:
-    """Return tracks with a frame's sightings (S, 3) px as a new column: ids, and arrays as those of ``tracks``.
-
-    ``tracks`` are those of :func:`normals_in_view`, ``track_ids`` (F,) theirs and ``ascending`` (F,) their rows in the
-    order of the ids. Tracks that no pose has seen leave; ids (S,) unknown so far start new tracks, after the others.
-    """
-    uvs_px, seen, weights, points = tracks
-    before, window = seen.shape
-    row_of, source, count = np.full(before, -1), np.empty(before + frame_ids.size, dtype=np.int64), 0
-    for f in range(before):
-        for j in range(window):
-            if seen[f, j]:
-                row_of[f], source[count] = count, f
-                count += 1
-                break
-    kept, rows = count, np.empty(frame_ids.size, dtype=np.int64)
-    for i in range(frame_ids.size):
-        low, high = 0, before
-        while low < high:
-            middle = (low + high) // 2
-            if track_ids[ascending[middle]] < frame_ids[i]:
-                low = middle + 1
-            else:
-                high = middle
-        if low < before and track_ids[ascending[low]] == frame_ids[i] and row_of[ascending[low]] >= 0:
-            rows[i] = row_of[ascending[low]]
-        else:
-            rows[i], source[count] = count, i
-            count += 1
-    ids, now_points, now_uvs_px = np.empty(count, np.int64), np.empty((count, 3)), np.zeros((count, window + 1, 3))
-    now_seen, now_weights = np.zeros((count, window + 1), dtype=np.bool_), np.zeros((count, window + 1))
-    for row in range(count):
-        f = source[row]
-        ids[row] = track_ids[f] if row < kept else frame_ids[f]
-        for d in range(3):
-            now_points[row, d] = points[f, d] if row < kept else np.nan
-        if row < kept:
-            for j in range(window):
-                now_seen[row, j], now_weights[row, j] = seen[f, j], weights[f, j]
-                for d in range(3):
-                    now_uvs_px[row, j, d] = uvs_px[f, j, d]
-    for i in range(frame_ids.size):
-        now_seen[rows[i], window], now_weights[rows[i], window] = True, 1.0
-        for d in range(3):
-            now_uvs_px[rows[i], window, d] = frame_uvs_px[i, d]
-    return ids, now_uvs_px, now_seen, now_weights, now_points
-
-
 @kernel(_TRACKS, _WINDOW, _CAMERA, _LIMITS)
 def normals_in_view(
     tracks: Arrays, window: Arrays, camera: Arrays, limits: Arrays
@@ -783,81 +730,9 @@ def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, weigher: Arrays
     return e
 
 
-@kernel(
-    types.Tuple((_STACK, _MATRIX, _MATRIX)),
-    _WINDOW,
-    types.Tuple((_MATRIX, types.int64)),
-    _CAMERA,
-    _WEIGHER,
-    types.float64,
-)
-def test_landmarks(
-    sightings: Arrays, window: Arrays, belief: Arrays, camera: Arrays, weigher: Arrays, common_weight: float
-) -> tuple[Array, IntArray, BoolArray, Array, Array, Array]:
-    """Linearise the sightings of L landmarks of the state from the newest pose and test the innovation of each.
-
-    ``sightings`` are (uL, uR, v) (L, 1, 3) px, and the landmarks (L, 3), at present and where Jacobians are evaluated;
-    ``window`` has the newest pose alone; ``belief`` is the covariance P (n, n) of the whole state and the first column
-    of the landmarks, the newest pose having the last six.
-
-    Returns the NIS (L,), its degrees of freedom (L,), which are accepted (L,); and of the m rows of those, weighted,
-    H P (m, n), the lower half of ``H P H^T + 1`` (m, m) and the residuals (m,).
-    """
-    uvs_px, points, points_at = sightings
-    P, first = belief
-    count, n, end = points.shape[0], P.shape[0], 0
-    T_cam_world, T_cam_world_at, where = (
-        in_camera(window[0], camera),
-        in_camera(window[1], camera),
-        np.zeros(1, np.int64),
-    )
-    nis, dof, accepted = np.empty(count), np.full(count, 3), np.zeros(count, dtype=np.bool_)
-    A, J, columns = np.empty((3 * count, 4)), np.empty((3 * count, 6)), np.empty(count, dtype=np.int64)
-    here, HP, N = np.empty((3, 4)), np.empty((3 * count, n)), np.zeros((1, 4, 4))
-    for f in range(count):
-        depth = linearise_point(points, f, uvs_px, f, 0, (T_cam_world, T_cam_world, window[0]), camera, here, 0)
-        own, at = (A[end : end + 3], J[end : end + 3]), first + 3 * f
-        linearise(points_at, f, uvs_px, where, 1, (T_cam_world_at, T_cam_world_at, window[1]), camera, own)
-        for i in range(3):
-            own[0][i, 3] = N[0, 3, i] = here[i, 3]
-            for c in range(n):
-                HP[end + i, c] = 0.0
-            for b in range(9):
-                row, factor = (at + b, own[0][i, b]) if b < 3 else (n - 9 + b, own[1][i, b - 3])
-                for c in range(n):
-                    HP[end + i, c] += factor * P[row, c]
-            for k in range(i + 1):
-                N[0, i, k] = 1.0 if i == k else 0.0
-                for b in range(3):
-                    N[0, i, k] += HP[end + i, at + b] * own[0][k, b]
-                for b in range(6):
-                    N[0, i, k] += HP[end + i, n - 6 + b] * own[1][k, b]
-        x, y, z = solve(N, 0, 0.0, 0.0, right_side(N, 0))
-        nis[f] = x * N[0, 3, 0] + y * N[0, 3, 1] + z * N[0, 3, 2]
-        dof[f] -= math.isnan(uvs_px[f, 0, 1])
-        weight = common_weight * weight_of(nis[f], dof[f], weigher) if depth > 0.0 else 0.0
-        accepted[f] = weight > 0.0
-        if accepted[f]:
-            scale(own, 0, 3, weight)
-            for i in range(end, end + 3):
-                for c in range(n):
-                    HP[i, c] *= math.sqrt(weight)
-            columns[end // 3], end = at, end + 3
-    S, residuals = np.empty((end, end)), np.empty(end)
-    for i in range(end):
-        residuals[i] = A[i, 3]
-        for k in range(i + 1):
-            S[i, k] = 1.0 if i == k else 0.0
-            for b in range(3):
-                S[i, k] += HP[i, columns[k // 3] + b] * A[k, b]
-            for b in range(6):
-                S[i, k] += HP[i, n - 6 + b] * J[k, b]
-    return nis, dof, accepted, HP[:end], S, residuals
-
-
 def _what_was_compiled() -> tuple[str, ...]:
     """Return a line about the compilation, if it was not done before."""
-    stats = [each.stats for each in (eliminate_tracks, with_frame, normals_in_view, add_newest, test_landmarks)]
+    stats = [each.stats for each in (eliminate_tracks, normals_in_view, add_newest)]
     if all(each.cache_hits for each in stats):
         return ()
     kept = all(each.cache_path for each in stats)

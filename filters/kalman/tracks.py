@@ -25,14 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.joint import (
-    JointBelief,
-    Linearisation,
-    divided_by_root,
-    regular_root,
-    root_with_information,
-    times_root,
-)
+from filters.kalman.joint import JointBelief, divided_by_root, regular_root, root_with_information, times_root
+from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
@@ -86,13 +80,21 @@ class WindowTracks:
 
     def add_frame(self, frame: StereoFrame) -> None:
         """Append the frame's sightings as a new column; ids unknown so far start new tracks, tracks unseen leave."""
-        from filters.kalman import kernels
+        kept, known = np.flatnonzero(self.seen.any(axis=1)), self.seen.shape[1]
+        ids = self.track_ids[kept]
+        new = frame.track_ids[~is_among(frame.track_ids, ids)]
+        self.track_ids = np.concatenate([ids, new])
+        order = np.argsort(self.track_ids)
+        rows = order[np.searchsorted(self.track_ids, frame.track_ids, sorter=order)]
 
-        tracks = self.uvs_px, self.seen, self.weights, self.points
-        frame_ids, frame_uvs_px = np.ascontiguousarray(frame.track_ids), np.ascontiguousarray(frame.uvs_px)
-        self.track_ids, self.uvs_px, self.seen, self.weights, self.points = kernels.with_frame(
-            self.track_ids, tracks, np.argsort(self.track_ids), frame_ids, frame_uvs_px
-        )
+        def widened(of_tracks: Array, newest: Array | float) -> Array:
+            result = np.zeros((order.size, known + 1, *of_tracks.shape[2:]), of_tracks.dtype)
+            result[: ids.size, :known], result[rows, known] = of_tracks[kept], newest
+            return result
+
+        self.uvs_px, self.weights = widened(self.uvs_px, frame.uvs_px), widened(self.weights, 1.0)
+        self.seen = widened(self.seen, True)
+        self.points = np.concatenate([self.points[kept], np.full((new.size, 3), np.nan)])
 
     def drop_oldest(self, count: int) -> None:
         """Drop the sightings from the ``count`` oldest poses."""
@@ -209,29 +211,6 @@ def _tested(
     less = sightings.select(mismatched)
     less.seen[np.arange(mismatched.size), worst[mismatched]] = False
     return passed, less
-
-
-def correct_by_landmarks(
-    joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate
-) -> None:
-    """Do as :func:`joint_landmarks.correct`: correct the whole state by its landmarks, all shown by the frame."""
-    from filters.kalman import kernels
-
-    if not len(joint.landmark_ids):
-        return
-    order = np.argsort(frame.track_ids)
-    uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
-    nis, dof, accepted, *innovation = kernels.test_landmarks(
-        (uvs_px[:, None], joint.points, at.points(joint)),
-        (joint.clones[-1:], at.clones(joint)[-1:]),
-        (joint.cov, joint.landmark_columns.start),
-        camera_for_kernels(rig),
-        gate.limits(3),
-        gate.track_weight,
-    )
-    gate.count(nis, dof, accepted)
-    if accepted.any():
-        joint.update_carried(*innovation)
 
 
 def given_tracks_in_view(

@@ -132,6 +132,12 @@ def with_clones(
     return sequence, joint
 
 
+def update_by_rows(joint: JointBelief, H: Array, residuals: Array, columns: slice) -> None:
+    """Correct a belief by whitened residuals (m,) with their Jacobian (m, k) to some columns of its error."""
+    cross = H @ joint.cov[columns]
+    joint.update(cross, cross[:, columns] @ H.T + np.eye(len(H)), residuals)
+
+
 def recording_with_a_fleck(scenario: Scenario, tracks: int, seed: int, depth_m: float) -> Sequence:
     """Return a recording of few tracks, with a point that moves with the car tracked throughout."""
     sequence = short(scenario, scenario.duration_s, tracks, seed)

@@ -63,10 +63,11 @@ def scene(scenario, belief: str = "anchored", disturbed: float = 2.0) -> Scene:
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario, belief) -> None:
     joint, frame, rig = scene(scenario, belief)
-    n, part = joint.cov.shape[0], joint_landmarks.columns(joint)
+    n = joint.cov.shape[0]
     delta = 0.02 * np.random.default_rng(3).standard_normal(n)
     delta[-6:] = delta[:6]
     measurement = Scene(joint, frame, rig).measurement()
+    part = measurement.part
 
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
@@ -132,7 +133,7 @@ class LagZero:
     """A graph of one pose and the landmarks: the prediction as a Gaussian, and the sightings of one frame."""
 
     def __init__(self, given: Scene) -> None:
-        self._joint, part = given.joint, joint_landmarks.columns(given.joint)
+        self._joint, part = given.joint, given.measurement().part
         self._keys = [*(L(i) for i in given.joint.landmark_ids.tolist()), X(0)]
         noise = gtsam.noiseModel.Gaussian.Covariance(given.joint.cov[part, part])
         self._sightings = list(StereoFactors(given.rig).of(given.frame, 0))
@@ -194,7 +195,8 @@ class LagZero:
 def test_it_is_a_lag_zero_smoother_at_convergence(scenario) -> None:
     """In the mean, and in the covariance: ``(P^-1 + H^T H)^-1`` with GTSAM's Jacobians at the corrected estimate."""
     joint, frame, rig = given = scene(scenario)
-    graph, measurement, part = LagZero(given), given.measurement(), joint_landmarks.columns(joint)
+    graph, measurement = LagZero(given), given.measurement()
+    part = measurement.part
     smoothed = graph.solved()
     pose = smoothed.atPose3(X(0)).matrix()
     points = np.array([smoothed.atPoint3(L(i)) for i in joint.landmark_ids.tolist()])

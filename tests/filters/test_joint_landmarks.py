@@ -1,6 +1,5 @@
 """Which landmarks of a joint belief a frame may correct, whichever way the update is made."""
 
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from filters import iekf
 from filters.kalman import joint_landmarks
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
-from filters.kalman.tracks import correct_by_landmarks
 from tests.filters.conftest import with_clones
 from toolkit.geometry import transform
 from toolkit.measurements import StereoFrame
@@ -17,7 +15,7 @@ from toolkit.models import stereo
 from toolkit.models.gating import FrameGate
 from toolkit.simulation import FLIGHT
 
-CORRECT = {"single": joint_landmarks.correct, "compiled": correct_by_landmarks, "iterated": iekf.correct}
+CORRECT = {"single": joint_landmarks.correct, "iterated": iekf.correct}
 
 
 @pytest.mark.parametrize("correct", CORRECT.values(), ids=CORRECT)
@@ -37,27 +35,38 @@ def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residua
 
 @pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
 @pytest.mark.parametrize("left_only", [0.0, 0.3])
-def test_the_compiled_correction_is_the_textbooks(at, left_only):
+def test_the_correction_is_the_kalman_update_by_all_sightings_that_count(at, left_only):
     """Of three clones and of landmarks that are mismatched, weighed down, left-only and behind the camera."""
     sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 2, 3)
-    rig, rng = replace(sequence.rig, track_weight=0.5), np.random.default_rng(3)
-    points = (
-        rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 9.0], size=(20, 3)) * np.where(np.arange(20) == 4, -1.0, 1.0)[:, None]
-    )
+    rig, rng, count = replace(sequence.rig, track_weight=0.5), np.random.default_rng(3), 20
+    points = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 9.0], size=(count, 3))
+    points[4] *= -1.0
     world = transform(joint.clones[-1] @ rig.T_imu_cam, points)
-    joint.add_landmarks(np.arange(20), world, 0.1 * rng.normal(size=(60, 18)), np.tile(1e-3 * np.eye(3), (20, 1, 1)))
+    covs = np.tile(1e-3 * np.eye(3), (count, 1, 1))
+    joint.add_landmarks(np.arange(count), world, 0.1 * rng.normal(size=(3 * count, 18)), covs)
     joint.move(np.sqrt(np.diag(joint.cov)) * 0.3 * rng.normal(size=len(joint.cov)))
-    uvs_px = stereo.predict(joint.points, joint.clones[-1], rig).uv_px + 4.0 * rng.normal(size=(20, 3))
+    uvs_px = stereo.predict(joint.points, joint.clones[-1], rig).uv_px + 4.0 * rng.normal(size=(count, 3))
     uvs_px[2] += 300.0
-    uvs_px[rng.random(20) < left_only, 1] = np.nan
-    frame, one, other = StereoFrame(0, np.arange(20)[::-1], uvs_px[::-1]), copy(joint), copy(joint)
-    gates = FrameGate(0.999, 1.0, rig.track_weight), FrameGate(0.999, 1.0, rig.track_weight)
-    joint_landmarks.correct(one, frame, at, rig, gates[0])
-    correct_by_landmarks(other, frame, at, rig, gates[1])
-    assert 0 < gates[0].accepted < gates[0].tested - 1
-    assert gates[1].info() == pytest.approx(gates[0].info(), rel=1e-9)
-    sigmas = np.sqrt(np.diag(joint.cov))
-    np.testing.assert_allclose(other.cov / np.outer(sigmas, sigmas), one.cov / np.outer(sigmas, sigmas), atol=1e-9)
-    np.testing.assert_allclose(other.clones, one.clones, atol=1e-9)
-    np.testing.assert_allclose(other.points, one.points, atol=1e-9)
-    assert np.abs(one.points - joint.points).max() > 1e-2, "there was something to agree on"
+    uvs_px[rng.random(count) < left_only, 1] = np.nan
+    first, (P, n), rows, residuals = joint.landmark_columns.start, (joint.cov, len(joint.cov)), [], []
+    gate = FrameGate(0.999, 1.0, rig.track_weight)
+    for i, uv_px in enumerate(uvs_px):
+        now = stereo.predict(joint.points[i : i + 1], joint.clones[-1], rig)
+        there = stereo.predict(at.points(joint)[i : i + 1], at.clones(joint)[-1], rig)
+        whitener, H = stereo.whitener(uv_px, rig), np.zeros((3, n))
+        H[:, first + 3 * i :][:, :3], H[:, -6:] = whitener @ there.d_uv_d_point[0], whitener @ there.d_uv_d_pose[0]
+        residual = whitener @ stereo.residuals_px(uv_px, now.uv_px[0])
+        nis, dof = residual @ np.linalg.solve(H @ P @ H.T + np.eye(3), residual), stereo.degrees_of_freedom(uv_px)
+        weight = gate.weights(
+            np.array([nis]), int(dof), np.array([nis < gate.bound(int(dof)) and now.depth_m[0] > 0.0])
+        )
+        rows.append(np.sqrt(weight[0]) * H)
+        residuals.append(np.sqrt(weight[0]) * residual)
+    H, sigmas = np.vstack(rows), np.sqrt(np.diag(P))
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
+    expected, moved = P - gain @ H @ P, joint.displaced(gain @ np.concatenate(residuals))
+    joint_landmarks.correct(joint, StereoFrame(0, np.arange(count)[::-1], uvs_px[::-1]), at, rig, gate)
+    assert 0 < gate.accepted < gate.tested - 1
+    np.testing.assert_allclose(joint.cov / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-9)
+    np.testing.assert_allclose(joint.clones, moved.clones, atol=1e-9)
+    np.testing.assert_allclose(joint.points, moved.points, atol=1e-9)

@@ -17,7 +17,7 @@ from filters.kalman.coordinates import CloneAnchoredBelief
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import EliminatedTracks, WindowPoses, WindowTracks, eliminated_tracks
 from filters.msckf import Msckf
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded, update_by_rows
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.models.gating import FrameGate
@@ -126,7 +126,7 @@ def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(row
     begin, end = joint.clone_columns.start + 6 * first, joint.clone_columns.stop
     H, residuals = 100.0 * rng.normal(size=(rows, end - begin)), rng.normal(size=rows)
     before, other, sigmas = (joint.core, joint.clones), copy.copy(joint), np.sqrt(np.diag(joint.cov))
-    joint.update(H, residuals, slice(begin, end))
+    update_by_rows(joint, H, residuals, slice(begin, end))
     information, most = H.T @ H, 2.0 * (H**2).sum()
     taken = np.linalg.cholesky(most * np.eye(len(information)) - information).T
     other.inform(np.tile(most * np.eye(6), (len(information) // 6, 1, 1)), taken, H.T @ residuals)

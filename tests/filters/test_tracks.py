@@ -23,7 +23,7 @@ from filters.kalman.tracks import (
     eliminated_tracks,
     given_tracks_in_view,
 )
-from tests.filters.conftest import recorded, with_clones
+from tests.filters.conftest import recorded, update_by_rows, with_clones
 from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
@@ -100,7 +100,7 @@ def found_of(sightings, window, rig, probability=0.95):
 def flight():
     """A window of a flight, corrected once so that first and latest estimates differ."""
     sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 2, WIDTH)
-    joint.update(np.eye(6, 6 * WIDTH, 6 * WIDTH - 6) * 40.0, np.full(6, 0.3), joint.clone_columns)
+    update_by_rows(joint, np.eye(6, 6 * WIDTH, 6 * WIDTH - 6) * 40.0, np.full(6, 0.3), joint.clone_columns)
     return sequence.rig, joint, window_of(joint)
 
 
