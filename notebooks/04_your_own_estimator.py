@@ -28,8 +28,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Setup
 from toolkit.gate.baseline import Case
-from toolkit.gate.case_check import CheckTerms
-from toolkit.gate.checking import check, new_baseline
+from toolkit.gate.checking import CheckTerms, check, new_baseline
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
 from toolkit.measurements import Packet, StereoFrame
 from toolkit.metrics import score_run

@@ -39,8 +39,9 @@ import gate_pool
 from toolkit.experiment.statistics import holm
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
-from toolkit.gate.case_check import CaseVerdicts, changed_metrics
-from toolkit.gate.significance import Pairs, Where
+from toolkit.gate.checking import changed_metrics
+from toolkit.gate.significance import Pairs
+from toolkit.gate.verdict import Where
 from toolkit.progress import silent
 
 CASES = {"flight": 2.5, "drive": 25.0}
@@ -225,7 +226,7 @@ def measure_turns(times: Path, revision: str) -> None:
     cases = [Case(source, True, (0,), ESTIMATORS, seconds) for source, seconds in CASES.items()]
     baseline = Baseline({}, tuple((case, Measured((), (), {})) for case in cases))
     with patch.object(interleaved, "pairs_needed", lambda _differences: MOST_TIMED):
-        found = interleaved.timed_in_turn(baseline, revision, silent, CaseVerdicts())
+        found, _, _ = interleaved.timed_in_turn(baseline, revision, silent)
     lines = [json.dumps([one.case, one.estimator, one.cpu_s.tolist()]) for one in found]
     times.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

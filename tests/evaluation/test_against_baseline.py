@@ -21,7 +21,8 @@ from toolkit.evaluation.against_baseline import (
 )
 from toolkit.evaluation.scoring import TIME_COVERAGE
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.significance import Repeats, Where, check_metrics
+from toolkit.gate.significance import Repeats, check_metrics
+from toolkit.gate.verdict import Where
 
 CHECK = ("check", "--trajectories", "results", "--baseline", "base.json")
 BASELINE = ("baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json")

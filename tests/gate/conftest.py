@@ -8,8 +8,7 @@ import pytest
 from msgspec import structs
 
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, SeriesRecord, installed_releases
-from toolkit.gate.case_check import CaseVerdicts, CheckTerms, check_case
-from toolkit.gate.checking import check_all
+from toolkit.gate.checking import CaseVerdicts, CheckTerms, check_all, check_case
 from toolkit.gate.verdict import Check
 
 SEEDS = tuple(range(24))

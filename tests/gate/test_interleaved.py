@@ -98,12 +98,11 @@ def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path, monkeypatch
     monkeypatch.setattr(interleaved, "MOST_PAIRS", 8)
     wheel = tmp_path / "slow-1.0-py3-none-any.whl"
     wheel_of_this_code(wheel, runner=SLOWLY)
-    speeds = compare_speed(baseline_of_a_drive(), str(wheel), 0.05, silent)
-    (speed,) = speeds.verdicts
+    (speed,), notes = compare_speed(baseline_of_a_drive(), str(wheel), 0.05, silent)
     assert (speed.estimator, speed.metric, speed.finding) == ("dead-reckoning", "speed", "better")
     assert -85.0 < speed.change_percent < -60.0
     assert "processor time of" in speed.words
-    assert speeds.notes == []
+    assert notes == []
 
 
 class Side:
@@ -136,9 +135,9 @@ def test_what_the_other_code_can_be_timed_on_and_this_one_cannot_is_missing(monk
     monkeypatch.setattr(interleaved, "timers", lambda *_: nullcontext((Side("old", *old), Side("new", *new))))
     case = Case("drive", True, (0,), ("ekf",), 1.0)
     measured = Measured(("hash",), ("print",), {"ekf": SeriesRecord(status=("ok",), speed=(1.0,), causal={})})
-    speeds = compare_speed(Baseline(installed_releases(), ((case, measured),)), "v1", 0.05, silent)
-    assert [verdict.finding for verdict in speeds.verdicts] == ([] if found == "noted" else [found])
-    assert bool(speeds.notes) is (found == "noted")
+    verdicts, notes = compare_speed(Baseline(installed_releases(), ((case, measured),)), "v1", 0.05, silent)
+    assert [verdict.finding for verdict in verdicts] == ([] if found == "noted" else [found])
+    assert bool(notes) is (found == "noted")
 
 
 def test_what_is_timed_is_read_as_what_is_measured(monkeypatch):

@@ -17,7 +17,7 @@ from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.experiment.units import Outcome
 from toolkit.gate.baseline import Measured, SeriesRecord
-from toolkit.gate.case_check import CheckTerms, check_case
+from toolkit.gate.checking import CheckTerms, check_case
 from toolkit.gate.measuring import TimedOutcome, gathered
 from toolkit.geometry import se3_exp
 
@@ -183,4 +183,4 @@ def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline)
         now = edited(one_seed, lambda _n, k, v, f=1.0 + percent / 100.0: v * f if k == "ate_se3_m" else v)
         check = checked(single, [as_another_trajectory(now), as_measured(baseline)[1]], accept_better=True)
         assert any("one seed" in note for note in check.notes)
-        assert bool([v for v in check.failures if v.metric == "ate_se3_m"]) is fails
+        assert bool([v for v in check.failing if v.metric == "ate_se3_m"]) is fails

@@ -10,7 +10,6 @@ from msgspec import structs
 
 from tests.gate.conftest import as_measured, checked, edited, planted
 from toolkit.cli import main
-from toolkit.gate.verdict import check_document
 from toolkit.report.gate import BEGINNINGS, WRITERS, gate_markdown, gate_text, write_check
 from toolkit.report.records import read_check
 
@@ -44,7 +43,7 @@ def test_junit_parses_and_counts_right(check, tmp_path):
     root = ElementTree.parse(tmp_path / "gate.xml").getroot()
     cases = root.findall("./testsuite/testcase")
     assert int(root.get("tests")) == len(cases) == len(check.verdicts)
-    assert int(root.get("failures")) == len(root.findall(".//failure")) == len(check.failures)
+    assert int(root.get("failures")) == len(root.findall(".//failure")) == len(check.failing)
     for suite in root:
         assert int(suite.get("tests")) == len(suite.findall("testcase"))
         assert int(suite.get("failures")) == len(suite.findall("testcase/failure"))
@@ -55,16 +54,16 @@ def test_junit_parses_and_counts_right(check, tmp_path):
 def test_json_has_every_verdict_and_no_number_that_is_none(check, tmp_path):
     write_check(check, {"json": tmp_path / "deep" / "gate.json"})
     document = json.loads((tmp_path / "deep" / "gate.json").read_text(), parse_constant=pytest.fail)
-    assert read_check(tmp_path / "deep" / "gate.json") == check_document(check)
+    assert read_check(tmp_path / "deep" / "gate.json") == check
     assert document["schema"] == "vislam.check/2"
     assert document["passed"] is check.passed
-    assert document["failures"] == len(check.failures)
+    assert document["failures"] == len(check.failing)
     assert [v["fails"] for v in document["verdicts"]] == [v.fails for v in check.verdicts]
     assert document["tests"] == sum(v["p"] is not None for v in document["verdicts"])
 
 
 def test_the_table_has_what_fails_and_all_with_verbose(check):
-    for verbose, shown in ((False, check.failures), (True, check.verdicts)):
+    for verbose, shown in ((False, check.failing), (True, check.verdicts)):
         table = gate_text(check, verbose=verbose).split("\n\n")[0].splitlines()
         found = [line.split()[0] for line in table if line.startswith("  ") and not line.startswith("  ---")]
         assert found[2:] == [verdict.metric for verdict in shown] if shown else table[0].startswith("notes")
@@ -72,8 +71,10 @@ def test_the_table_has_what_fails_and_all_with_verbose(check):
 
 def test_no_name_in_the_table_is_folded_nor_wider_than_100_columns(failed):
     names = {"sequence": "a-recording-of-a-long-name/part.2", "metric": "heldout_reproj_median_px"}
-    verdicts = [replace(v, **names, output="causal", before=0.00012345, after=123456.7) for v in failed.verdicts]
-    table = gate_text(replace(failed, verdicts=tuple(verdicts)), verbose=True).split("\n\n")[0].splitlines()
+    verdicts = [
+        structs.replace(v, **names, output="causal", before=0.00012345, after=123456.7) for v in failed.verdicts
+    ]
+    table = gate_text(structs.replace(failed, verdicts=tuple(verdicts)), verbose=True).split("\n\n")[0].splitlines()
     assert sum(names["metric"] in line for line in table) == len(verdicts)
     assert {line for line in table if names["sequence"] in line} == {
         f"{names['sequence']}, {v.estimator} causal" for v in failed.verdicts

@@ -228,8 +228,7 @@ def _check_of_estimators(options: argparse.Namespace) -> Check:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline import check_releases, load_baseline
-    from toolkit.gate.case_check import CheckTerms
-    from toolkit.gate.checking import check
+    from toolkit.gate.checking import CheckTerms, check
 
     if options.speed_against and options.skip_speed:
         raise UsageError("--speed-against and --skip-speed exclude each other")

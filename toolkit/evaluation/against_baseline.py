@@ -29,10 +29,10 @@ from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth
 from toolkit.evaluation.standings import EvaluationRecord, RunRecord, evaluated_run, read_evaluation
 from toolkit.files import documents
 from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, MetricValues, Percent, Values, json_text
-from toolkit.gate.case_check import check_recorded
+from toolkit.gate.checking import check_recorded
 from toolkit.gate.measuring import place_of
-from toolkit.gate.significance import FEWEST_RUNS, Everywhere, Repeats, Where, check_metrics
-from toolkit.gate.verdict import Check, Finding, Verdict
+from toolkit.gate.significance import FEWEST_RUNS, Everywhere, Repeats, check_metrics
+from toolkit.gate.verdict import Check, Finding, Verdict, Where, verdict_on
 from toolkit.geometry import Array
 from toolkit.settings import SettingsError
 
@@ -305,8 +305,10 @@ def check_trajectories(
     rate = baseline.false_alarm_rate
     verdicts += check_metrics(tests, rate, accept_better=accept_better)
     verdicts.sort(key=lambda verdict: [*order, EVERYWHERE].index(verdict.sequence))
-    notes, seconds = list(dict.fromkeys(notes)), time.monotonic() - began
-    return Check(name, tuple(verdicts), tuple(notes), rate, len(tests), {}, seconds, accept_better)
+    return Check.of(
+        verdicts, baseline=name, notes=tuple(dict.fromkeys(notes)), false_alarm_rate=rate, tests=len(tests),
+        releases={}, seconds=time.monotonic() - began, accept_better=accept_better,
+    )  # fmt: skip
 
 
 def everywhere(tests: Iterable[Repeats]) -> Iterator[Repeats]:
@@ -319,8 +321,8 @@ def everywhere(tests: Iterable[Repeats]) -> Iterator[Repeats]:
             yield Everywhere.of(Where(EVERYWHERE, "", "", key), parts)
 
 
-def _verdict(before: SequenceRecord, metric: str, finding: Finding, *rest: object) -> Verdict:
-    return Verdict(before.sequence, "", "", metric, finding, *rest)  # type: ignore[arg-type]
+def _verdict(before: SequenceRecord, metric: str, finding: Finding, words: str, *values: float) -> Verdict:
+    return verdict_on(Where(before.sequence, "", "", metric), finding, words, *values)
 
 
 def _missing(

@@ -27,10 +27,9 @@ from toolkit.errors import printable
 from toolkit.experiment.statistics import holm
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import SPEED, Baseline, BaselineError, Case
-from toolkit.gate.case_check import CaseVerdicts
 from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER
-from toolkit.gate.verdict import Finding, Verdict
+from toolkit.gate.verdict import Finding, Verdict, Where, verdict_on
 from toolkit.geometry import Array
 from toolkit.progress import ProgressFor
 from toolkit.settings import changes_of
@@ -59,21 +58,24 @@ class TimedPairs:
         return logs[:, 1] - logs[:, 0]
 
 
-def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> CaseVerdicts:
-    """Judge the time of a baseline's estimators, the installed code's against another version's.
+def compare_speed(
+    baseline: Baseline, version: str, rate: float, progress_for: ProgressFor
+) -> tuple[list[Verdict], list[str]]:
+    """Judge the time of a baseline's estimators, the installed code's against another version's; also return notes.
 
     Raises BaselineError where the version cannot be found or cannot be timed.
     """
-    found = CaseVerdicts()
-    found.verdicts += check_speeds(timed_in_turn(baseline, version, progress_for, found), version, rate)
-    return found
+    timed, verdicts, notes = timed_in_turn(baseline, version, progress_for)
+    return [*verdicts, *check_speeds(timed, version, rate)], notes
 
 
-def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor, found: CaseVerdicts) -> list[TimedPairs]:
-    """Time the estimators of a baseline in both versions; what only the other could be timed on is found missing."""
+def timed_in_turn(
+    baseline: Baseline, version: str, progress_for: ProgressFor
+) -> tuple[list[TimedPairs], list[Verdict], list[str]]:
+    """Time the estimators of a baseline in both versions; what only the other could be timed on is missing."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    timed = list[TimedPairs]()
+    timed, verdicts, notes = list[TimedPairs](), list[Verdict](), list[str]()
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
         known_to = [side.request("where", estimators=names) for side in sides]
         if known_to[0] == known_to[1]:
@@ -81,23 +83,30 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor, f
             raise BaselineError(f"{version} does not contain the code that runs here ({here_too}); name another")
         there, here = ({name for name in names if side["files"][name] is not None} for side in known_to)
         if new := [name for name in names if name not in there]:
-            found.notes.append(f"{', '.join(new)}: not in {version}, and not timed")
+            notes.append(f"{', '.join(new)}: not in {version}, and not timed")
         for case in cases:
             known = [name for name in case.estimators if name in there]
-            found.verdicts += [
-                _not_timed(case.source, name, "is not there any more") for name in known if name not in here
-            ]
+            verdicts += [_not_timed(case.source, name, "is not there any more") for name in known if name not in here]
             both = [name for name in known if name in here]
             with progress_for(f"{case.source}: speed against {version}") as progress:
                 _prepare(sides, case, baseline)
                 for done, name in enumerate(both):
                     progress.advance(done, len(both))
-                    timed += _times(sides, case.source, name, found)
-    return timed
+                    there_ends, here_ends = (
+                        side.request("run", estimator=name)["status"] for side in sides
+                    )  # warms up
+                    if there_ends == here_ends == "ok":
+                        timed.append(_times(sides, case.source, name))
+                    elif there_ends == "ok":
+                        verdicts.append(_not_timed(case.source, name, f"ends {here_ends} here and ended well there"))
+                    else:
+                        ends = f"ends {there_ends} there and {here_ends} here"
+                        notes.append(f"{case.source}: {name} {ends}, and is not timed")
+    return timed, verdicts, notes
 
 
 def _not_timed(case: str, estimator: str, why: str) -> Verdict:
-    return Verdict(case, estimator, "", SPEED, "missing", why)
+    return verdict_on(Where(case, estimator, "", SPEED), "missing", why)
 
 
 def check_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
@@ -111,9 +120,10 @@ def check_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iter
         ratio, (was, is_) = float(np.exp(np.median(timed.differences))), np.median(timed.cpu_s, axis=0).tolist()
         message = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
         seen = 100.0 * float(np.expm1(_detectable(timed.differences, rate / len(found))))
-        yield Verdict(
-            timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else message, was, is_,
-            100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
+        where, change = Where(timed.case, timed.estimator, "", SPEED), 100.0 * (ratio - 1.0)
+        yield verdict_on(
+            where, finding, "" if finding == "same" else message, was, is_, change, 100.0 * MARGIN,
+            p=p_faster if finding == "better" else p, seen_percent=seen,
         )  # fmt: skip
 
 
@@ -204,18 +214,12 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
         )
 
 
-def _times(sides: Sequence[Process], source: str, estimator: str, found: CaseVerdicts) -> Iterator[TimedPairs]:
-    """Time both sides in turn; a run that does not end well is found, as a failure if it did in the other code."""
-    there, here = (side.request("run", estimator=estimator)["status"] for side in sides)  # warms up, and is not counted
-    if there == here == "ok":
-        pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
-        more = pairs_needed(TimedPairs(source, estimator, pairs).differences)
-        further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
-        yield TimedPairs(source, estimator, np.array([*pairs.tolist(), *further]))
-    elif there == "ok":
-        found.verdicts.append(_not_timed(source, estimator, f"ends {here} here and ended well there"))
-    else:
-        found.notes.append(f"{source}: {estimator} ends {there} there and {here} here, and is not timed")
+def _times(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs:
+    """Time both sides in turn, as often as the scatter of the first pairs requires."""
+    pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
+    more = pairs_needed(TimedPairs(source, estimator, pairs).differences)
+    further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
+    return TimedPairs(source, estimator, np.array([*pairs.tolist(), *further]))
 
 
 def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from scipy.special import stdtr, stdtrit
 
 from toolkit.experiment.statistics import holm, paired_p, standard_error
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.verdict import FAILURES, Finding, Verdict
+from toolkit.gate.verdict import FAILURES, Finding, Verdict, Where, verdict_on
 from toolkit.geometry import Array
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 
@@ -28,16 +28,6 @@ ROUNDING = 1e-6
 _LEAST = 1e-12
 # With fewer runs than this on either side their spread is unknown, and only the bound is applied.
 FEWEST_RUNS = 3
-
-
-@dataclass(frozen=True)
-class Where:
-    """The subject of a verdict."""
-
-    sequence: str
-    estimator: str
-    output: str
-    metric: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,12 +217,11 @@ def _verdict(one: Pairs | Repeats, finding: Finding, p: float, seen: float) -> V
     message = "" if finding == "same" else f"{percent_text(change)} {one.runs}"
     if finding in FAILURES:
         message += f", and chance explains that with p = {p:.2g}"
-    where = one.where
-    return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, finding, message,
-        before=geometric_mean(one.before), after=geometric_mean(one.after), change_percent=change,
-        allowed_percent=one.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
-    )  # fmt: skip
+    before, after = geometric_mean(one.before), geometric_mean(one.after)
+    seen_percent = 100.0 * float(np.expm1(seen))
+    return verdict_on(
+        one.where, finding, message, before, after, change, one.criterion.percent, p=p, seen_percent=seen_percent
+    )
 
 
 def percent_text(change: float) -> str:

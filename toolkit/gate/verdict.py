@@ -1,75 +1,36 @@
-"""The verdict on one metric and on the whole check; as JSON, the contract ``vislam.check/2`` (docs/gate.md)."""
+"""The verdict on one metric and on the whole check: the contract ``vislam.check/2`` (docs/gate.md)."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit.files.documents import Json, Older, of_attributes
+from toolkit.files.documents import Json, Older
 
 Finding = Literal["regressed", "moved", "changed metric", "missing", "worse", "better", "same", "not judged"]
 FAILURES: tuple[Finding, ...] = ("regressed", "moved", "changed metric", "missing")
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What became of one metric of one estimator on one sequence.
-
-    ``regressed`` is worse by more than is allowed; ``moved`` is another answer than chance explains, and no worse than
-    is allowed; ``changed metric`` is another number of the same trajectory; they and ``missing`` fail the check.
-    ``worse`` and ``better`` are changes that are shown and do not: within what is allowed, or for the good where that
-    is accepted. ``before`` and ``after`` are the baseline's value and the one now, means over the seeds where there are
-    several; ``change_percent`` is the relative change. ``p`` is adjusted for all tests of the check; ``seen_percent``
-    is the change this test would have detected with 95 % power.
-    """
+class Where:
+    """The subject of a verdict."""
 
     sequence: str
     estimator: str
     output: str
     metric: str
-    finding: Finding
-    words: str
-    before: float | None = None
-    after: float | None = None
-    change_percent: float | None = None
-    allowed_percent: float | None = None
-    p: float | None = None
-    seen_percent: float | None = None
-
-    @property
-    def fails(self) -> bool:
-        return self.finding in FAILURES
 
 
-@dataclass(frozen=True)
-class Check:
-    """Every verdict of a check, what a reader must know beside them, and how it was made.
+class Verdict(Struct, frozen=True, kw_only=True):
+    """What became of one metric of one estimator on one sequence; what is not finite or not checked is null.
 
-    ``tests`` is the number of statistical tests that share the ``false_alarm_rate``; ``accept_better`` says that what
-    moved passed unless it was worse.
+    ``regressed`` is worse by more than is allowed; ``moved`` is another answer than chance explains, and no worse than
+    is allowed; ``changed metric`` is another number of the same trajectory; they and ``missing`` fail the check.
+    ``worse`` and ``better`` are changes that are shown and do not: within what is allowed, or for the good where that
+    is accepted.
     """
-
-    baseline: str
-    verdicts: tuple[Verdict, ...]
-    notes: tuple[str, ...]
-    false_alarm_rate: float
-    tests: int
-    releases: dict[str, str]
-    seconds: float
-    accept_better: bool = False
-
-    @property
-    def failures(self) -> tuple[Verdict, ...]:
-        return tuple(verdict for verdict in self.verdicts if verdict.fails)
-
-    @property
-    def passed(self) -> bool:
-        return not self.failures
-
-
-class VerdictRecord(Struct, frozen=True, kw_only=True):
-    """What became of one metric of one estimator on one sequence; what is not finite or not checked is null."""
 
     sequence: str
     estimator: str
@@ -90,7 +51,21 @@ class VerdictRecord(Struct, frozen=True, kw_only=True):
             raise ValueError(f"fails does not fit the finding {self.finding!r}")
 
 
-class CheckDocument(Struct, frozen=True, kw_only=True):
+def verdict_on(
+    where: Where, finding: Finding, words: str, before: float | None = None, after: float | None = None,
+    change_percent: float | None = None, allowed_percent: float | None = None, **tested: float,
+) -> Verdict:  # fmt: skip
+    """Return a verdict; ``tested`` are ``p`` and ``seen_percent``, where there was a test."""
+    numbers = {"before": before, "after": after, "change_percent": change_percent, "allowed_percent": allowed_percent}
+    given = {"p": None, "seen_percent": None, **numbers, **tested}
+    return Verdict(
+        sequence=where.sequence, estimator=where.estimator, output=where.output, metric=where.metric, finding=finding,
+        words=words, fails=finding in FAILURES,
+        **{name: value if value is None or math.isfinite(value) else None for name, value in given.items()},
+    )  # fmt: skip
+
+
+class Check(Struct, frozen=True, kw_only=True):
     """Every verdict of a check, and how it was made."""
 
     schema: Literal["vislam.check/2"]
@@ -103,13 +78,24 @@ class CheckDocument(Struct, frozen=True, kw_only=True):
     seconds: Annotated[float, Meta(ge=0)]
     accept_better: Annotated[bool, Meta(description="whether what moved passed unless it was worse")]
     notes: tuple[str, ...]
-    verdicts: tuple[VerdictRecord, ...]
+    verdicts: tuple[Verdict, ...]
 
     def __post_init__(self) -> None:
-        if self.failures != sum(verdict.fails for verdict in self.verdicts):
+        if self.failures != len(self.failing):
             raise ValueError("failures does not count the verdicts that fail")
         if self.passed != (self.failures == 0):
             raise ValueError("passed does not fit failures")
+
+    @classmethod
+    def of(cls, verdicts: Iterable[Verdict], **others: Any) -> "Check":
+        """Return a check of verdicts; ``others`` are the fields that do not follow from them."""
+        every = tuple(verdicts)
+        failures = sum(verdict.fails for verdict in every)
+        return cls(schema="vislam.check/2", verdicts=every, failures=failures, passed=not failures, **others)
+
+    @property
+    def failing(self) -> tuple[Verdict, ...]:
+        return tuple(verdict for verdict in self.verdicts if verdict.fails)
 
 
 def _from_1(document: Json) -> Json:
@@ -118,19 +104,3 @@ def _from_1(document: Json) -> Json:
 
 
 OLDER_CHECKS: Older = {"vislam.check/1": _from_1}
-
-
-def check_document(check: Check) -> CheckDocument:
-    """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
-    return of_attributes(
-        CheckDocument,
-        check,
-        schema="vislam.check/2",
-        failures=len(check.failures),
-        releases=dict(check.releases),
-        verdicts=tuple(of_attributes(VerdictRecord, verdict, _finite) for verdict in check.verdicts),
-    )
-
-
-def _finite(value: object) -> object:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

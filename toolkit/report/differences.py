@@ -14,7 +14,8 @@ from msgspec import UNSET, Meta, Struct, to_builtins
 from toolkit.answers import Status
 from toolkit.experiment.statistics import holm
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
-from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats, Where
+from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats
+from toolkit.gate.verdict import Where
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.run_directory import RunFiles, SeedsFiles, repeated

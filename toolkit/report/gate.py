@@ -14,8 +14,8 @@ from toolkit.errors import printable
 from toolkit.evaluation.against_baseline import CHANGES_PERCENT, MOST_RUNS, WANTED, Planned
 from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
-from toolkit.gate.case_check import SHOWN
-from toolkit.gate.verdict import Check, Finding, Verdict, check_document
+from toolkit.gate.checking import SHOWN
+from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, number, section
 
@@ -44,7 +44,7 @@ def gate_table(check: Check) -> Table:
 
 
 def failures_table(check: Check) -> Table:
-    rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failures)
+    rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failing)
     headings = (*_LABELS, *_NUMBERS, ("why", "", ""))
     return Table(headings, rows, labels=len(_LABELS))
 
@@ -115,13 +115,13 @@ def headline(check: Check) -> str:
     tested = len(check.verdicts)
     if check.passed:
         return f"the gate passes: nothing got worse than {check.baseline} ({tested} comparisons)"
-    found = Counter(verdict.finding for verdict in check.failures)
+    found = Counter(verdict.finding for verdict in check.failing)
     counts = ", ".join(f"{found[finding]} {words}" for finding, words in _FAILED.items() if found[finding])
     return f"the gate fails: of {tested} comparisons with {check.baseline}, {counts}"
 
 
 def failure_lines(check: Check) -> Iterator[str]:
-    for verdict in check.failures:
+    for verdict in check.failing:
         yield f"{about(verdict)}: {verdict.words}"
 
 
@@ -144,7 +144,7 @@ def note_lines(check: Check) -> Iterator[str]:
             "'detects' is the change each of them finds with 95 % power, from how much it scatters"
         )
         yield f"what this check would have found in 95 % of cases: {'; '.join(_detected(check))}"
-    if any(verdict.finding == "moved" for verdict in check.failures):
+    if any(verdict.finding == "moved" for verdict in check.failing):
         yield (
             "what moved differs from the baseline and is no worse: --accept-better lets it pass, "
             "a new baseline adopts it"
@@ -196,7 +196,7 @@ def plan_text(plan: Sequence[Planned], width: Width = WIDTH) -> str:
 
 
 def gate_text(check: Check, width: Width = WIDTH, *, verbose: bool = False) -> str:
-    shown = check.verdicts if verbose else check.failures
+    shown = check.verdicts if verbose else check.failing
     lines = [*printed_lines(shown), ""] if shown else []
     lines += section("notes", note_lines(check), width)
     lines += section("fails", failure_lines(check), width)
@@ -207,7 +207,7 @@ def gate_markdown(check: Check) -> str:
     """Return a check as Markdown fit for a pull request: what failed on top, everything folded below."""
     mark, line = "✅" if check.passed else "❌", headline(check)
     parts = [f"## {mark} Accuracy gate", f"{line[0].upper()}{line[1:]}."]
-    if check.failures:
+    if check.failing:
         parts.append(as_markdown(failures_table(check)))
     parts.append("\n".join(f"- {line}" for line in note_lines(check)))
     everything = as_markdown(gate_table(check))
@@ -244,11 +244,7 @@ def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
     return {"tests": str(len(verdicts)), "failures": str(failures), "errors": "0", "skipped": "0"}
 
 
-WRITERS: Mapping[str, Callable[[Check], str]] = {
-    "junit": gate_junit,
-    "markdown": gate_markdown,
-    "json": lambda check: to_text(check_document(check)),
-}
+WRITERS: Mapping[str, Callable[[Check], str]] = {"junit": gate_junit, "markdown": gate_markdown, "json": to_text}
 # How the file of each kind begins.
 BEGINNINGS: Mapping[str, str] = {"junit": "<", "markdown": "#", "json": "{"}
 

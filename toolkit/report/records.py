@@ -16,7 +16,7 @@ from toolkit.evaluation.standings import EvaluationRecord
 from toolkit.files.documents import reader, schema
 from toolkit.files.writing import write_text
 from toolkit.gate.baseline import BaselineRecord
-from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
+from toolkit.gate.verdict import OLDER_CHECKS, Check
 from toolkit.report.card import CardRecord, read_card
 from toolkit.report.differences import DiffRecord
 from toolkit.report.explanation import ExplanationRecord, read_explanation
@@ -49,7 +49,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "manifest-1": Manifest,
     "baseline-1": BaselineRecord,
     "trajectory-baseline-1": TrajectoryBaselineRecord,
-    "check-2": CheckDocument,
+    "check-2": Check,
     "card-2": CardRecord,
     "evaluation-1": EvaluationRecord,
     "verification-1": VerificationRecord,
@@ -60,7 +60,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
 }
 
 
-read_check = reader(CheckDocument, "repeat vislam check", older=OLDER_CHECKS)
+read_check = reader(Check, "repeat vislam check", older=OLDER_CHECKS)
 
 
 def schema_files() -> dict[str, str]:

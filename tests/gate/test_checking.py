@@ -11,7 +11,7 @@ from toolkit.gate.baseline import COVERAGE
 
 
 def findings(check):
-    return [(v.sequence, v.estimator, v.metric, v.finding) for v in check.failures]
+    return [(v.sequence, v.estimator, v.metric, v.finding) for v in check.failing]
 
 
 def with_series(measured, estimator, **changes):
@@ -38,8 +38,8 @@ def test_a_planted_regression_fails_and_nothing_else_does(baseline, metric):
     simulated, recorded = as_measured(baseline)
     check = checked(baseline, [edited(simulated, planted(5.0, 1, metric=metric)), recorded])
     assert findings(check) == [("flight", "two", metric, "regressed")]
-    assert check.failures[0].p < 0.05
-    assert check.failures[0].change_percent == pytest.approx(5.0, abs=2.0)
+    assert check.failing[0].p < 0.05
+    assert check.failing[0].change_percent == pytest.approx(5.0, abs=2.0)
 
 
 def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(baseline):
@@ -164,7 +164,7 @@ def test_a_run_that_ended_well_and_no_longer_does_fails(baseline, status):
     changed = replace(changed, why={"two": "left the road"})
     check = checked(baseline, [changed, recorded])
     assert findings(check) == [("flight", "two", "status", "regressed")]
-    assert check.failures[0].words == f"{status} under seed 1: left the road"
+    assert check.failing[0].words == f"{status} under seed 1: left the road"
 
 
 def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline):
@@ -190,7 +190,7 @@ def test_other_measurements_are_not_compared(baseline):
     )
     check = checked(baseline, [other, recorded])
     assert findings(check) == [("flight", "", "sequence", "missing")]
-    assert "under seed 0" in check.failures[0].words
+    assert "under seed 0" in check.failing[0].words
 
 
 def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseline):
