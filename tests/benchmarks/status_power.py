@@ -33,7 +33,7 @@ import numpy as np
 from toolkit.answers import Output, Run
 from toolkit.errors import VislamError
 from toolkit.experiment.comparison import Row, consistency_of
-from toolkit.experiment.disagreement import too_far
+from toolkit.experiment.contests import too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
 from toolkit.measurements import NS_PER_S

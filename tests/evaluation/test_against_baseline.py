@@ -12,6 +12,7 @@ from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.against_baseline import (
     CHANGES_PERCENT,
+    ScoredSequence,
     SequenceRecord,
     check_trajectories,
     load_trajectory_baseline,
@@ -197,12 +198,12 @@ class Runs:
         self.runs, self.rng, self.grown = runs, rng, grown
         self.sequences = tuple(f"S{i}" for i in range(sequences))
 
-    def scored(self, sequence, align, gap_s, before) -> SequenceRecord:
+    def scored(self, sequence, align, gap_s, before) -> ScoredSequence:
         values = {key: 100.0 * np.ones(self.runs) for key in ("ate_se3_deg", "rpe_100m_percent", TIME_COVERAGE)}
         values["ate_se3_m"] = self.grown * np.exp(0.08 * self.rng.standard_normal(self.runs))
         files = tuple(f"{sequence}/{i}.tum" for i in range(self.runs))
         scores = {key: tuple(one.tolist()) for key, one in values.items()}
-        return SequenceRecord(sequence=sequence, truth="t", truth_hash="", files=files, scores=scores)
+        return SequenceRecord(sequence=sequence, truth="t", truth_hash="", files=files, scores=scores), {}
 
 
 def baseline(given: Runs):

@@ -1,12 +1,14 @@
 """Units of work that are quick, and outcomes made up for the tests of what is done with them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.recording import Recording
 from toolkit.experiment.units import Outcome, Scored, Unit
 from toolkit.geometry import Array
@@ -26,6 +28,13 @@ def units() -> Units:
         return [Unit(one, one.seed, name, keep_run=True) for one in recordings for name in estimators]
 
     return make
+
+
+@pytest.fixture
+def two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let recordings of plans last two seconds, which are drawn and audited at once, as a minute is not."""
+    whole = Plan.recording
+    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
 
 
 def scored(seed: int, nees: Array) -> Scored:

@@ -8,7 +8,7 @@ import pytest
 from toolkit.answers import Run
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.disagreement import FARTHEST, FarthestPose, farthest, too_far
+from toolkit.experiment.contests import FARTHEST, FarthestPose, farthest, too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Outcome, Scored, Unit, outcome_of, run_estimator
 from toolkit.geometry import Array, se3_exp

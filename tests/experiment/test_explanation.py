@@ -9,7 +9,6 @@ from toolkit.audit import Audit
 from toolkit.experiment import recording
 from toolkit.experiment.explanation import ERROR, GATE, Explanation, run_explanation
 from toolkit.experiment.pipeline import Plan
-from toolkit.report.explanation import explanation_document
 from toolkit.settings.reading import settings_of
 
 # By how much the logarithm of the error falls with the one ingredient in which a pair of estimators differs.
@@ -58,12 +57,6 @@ def written(folder: Path, name: str, has: tuple[str, ...], planted: str) -> str:
     return str(folder / f"{name}.py")
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return a folder for each pair of estimators, where runs are found again."""
-    return {planted: tmp_path_factory.mktemp(planted) for planted in PLANTED}
-
-
 @pytest.fixture(autouse=True)
 def without_audit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes most of the time and finds nothing in these recordings."""
@@ -74,23 +67,15 @@ def explanation_of(folder: Path, planted: str) -> Explanation:
     """Return why an estimator with two ingredients differs from one that lacks the one that has an effect."""
     names = written(folder, "plain", ("water",), planted), written(folder, "full", ("water", planted), planted)
     plan = Plan(("drive",), names, settings=settings_of({"seeds": 4}, "here"), max_frames=8, workers=1)
-    return run_explanation(plan, *names, folder / "kept")
+    return run_explanation(plan, *names)
 
 
 @pytest.mark.parametrize("planted", PLANTED)
-def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted, folders):
-    found = explanation_of(folders[planted], planted)
+def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted, tmp_path):
+    found = explanation_of(tmp_path, planted)
     assert {part.ingredient for part in found.parts} == {planted, "water", GATE}
     for part in found.parts:
         for effect in (part.first, part.last):
             (_, low, high), direct = effect.on_error.interval, PLANTED[planted] if part.ingredient == planted else 0.0
             assert low <= direct <= high, part.ingredient
             assert (ERROR in effect.shown) == (part.ingredient == planted)
-
-
-def test_a_second_run_finds_every_outcome_and_tells_the_same(folders):
-    first = explanation_document(explanation_of(folders["salt"], "salt"))
-    kept = (folders["salt"] / "kept" / "outcomes.jsonl").read_bytes()
-    again = explanation_document(explanation_of(folders["salt"], "salt"))
-    assert (folders["salt"] / "kept" / "outcomes.jsonl").read_bytes() == kept
-    assert (again.parts, again.gap, again.words) == (first.parts, first.gap, first.words)

@@ -22,10 +22,7 @@ SCALED = Trial.of("dead-reckoning", {"noise.motion_scale": 4.0})
 
 
 @pytest.fixture
-def plan(monkeypatch: pytest.MonkeyPatch) -> Plan:
-    whole = Plan.recording
-    # Two seconds are drawn and audited at once.
-    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
+def plan(two_seconds: None) -> Plan:
     settings = settings_of({"seeds": 2}, "here")
     return Plan(("drive",), ("dead-reckoning",), settings=settings, max_frames=12, workers=1)
 

@@ -1,5 +1,6 @@
 """Kept outcomes: found again to the bit, for what they depend on and nothing else, whatever a kill leaves behind."""
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from toolkit.report.scores import seeds_document
 from toolkit.settings import Settings
 from toolkit.settings.reading import settings_of
 
+PROJECT = Path(__file__).parents[2]
 TWO = ("dead-reckoning", "ekf")
 Sweep = Callable[..., Comparison]
 
@@ -46,11 +48,9 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> Ran:
 
 
 @pytest.fixture
-def sweep(tmp_path: Path, ran: Ran, monkeypatch: pytest.MonkeyPatch) -> Sweep:
+def sweep(tmp_path: Path, ran: Ran, two_seconds: None, monkeypatch: pytest.MonkeyPatch) -> Sweep:
     """Return a function that compares over seeds, with what ended kept in a directory."""
-    whole = Plan.recording
-    # Two seconds are drawn and audited at once, and a minute is not; nor are the two that tell what a seed changes.
-    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
+    # It would draw two whole recordings.
     monkeypatch.setattr(pipeline, "is_drawn_from_a_seed", lambda *_: True)
 
     def compare(
@@ -131,6 +131,14 @@ def drive_key() -> Callable[..., bytes]:
         return Conditions("data").key(Unit(Recording("drive"), 0, estimator, settings_of(settings, "here"))).text()
 
     return key
+
+
+def test_all_parts_above_the_experiment_and_no_others_change_no_result():
+    contracts = tomllib.loads((PROJECT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(one["layers"] for one in contracts if one["type"] == "layers")
+    above = [part for layer in layers[: layers.index("experiment")] for part in layer.split(" | ")]
+    there = {part if (PROJECT / "toolkit" / part).is_dir() else f"{part}.py" for part in above}
+    assert set(outcome_store._ABOVE) == there
 
 
 @pytest.mark.parametrize("changed", ["code_digest", "numeric_versions"])

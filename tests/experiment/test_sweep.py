@@ -139,9 +139,7 @@ def test_the_audit_names_what_was_planted_and_nothing_of_the_clean_recording():
 
 
 @pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> Plan:
-    whole = Plan.recording
-    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
+def short(two_seconds: None, plan: Plan) -> Plan:
     settings = settings_of({"seeds": 2}, "here")
     return replace(plan, estimators=("dead-reckoning",), settings=settings, max_frames=12, workers=1)
 

@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct, structs, to_builtins
+from msgspec import Meta, Struct, to_builtins
 from scipy.special import chdtri, nctdtr, stdtrit
 
 from toolkit.errors import DataError, no_such, one_line, printable
@@ -64,10 +64,8 @@ class SequenceRecord(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"scores.{key} does not have an entry a file")
 
 
-class CheckedRuns(SequenceRecord, frozen=True, kw_only=True):
-    """The runs of a sequence in a check, where one that failed has no scores; ``failed`` says why, by its file."""
-
-    failed: dict[str, str]
+# The runs of a sequence, and why some failed, by their files.
+ScoredSequence = tuple[SequenceRecord, Mapping[str, str]]
 
 
 class TrajectoryBaselineRecord(Struct, frozen=True, kw_only=True):
@@ -146,11 +144,12 @@ class FolderOfRuns:
         """The sequences there are files of; raises DataError where there are none."""
         return tuple(self._files)
 
-    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> ScoredSequence:
         """Score the files of a sequence; the truth is where it is given, or else where the baseline had it.
 
-        ``before`` is what the baseline has of it; beside it a file that cannot be used is a run that failed. Raises
-        DataError where there is no file, or none can be used, or one cannot of which a baseline is made.
+        ``before`` is what the baseline has of it; beside it a file that cannot be used is a run that failed, which has
+        no scores. Raises DataError where there is no file, or none can be used, or one cannot of which a baseline is
+        made.
         """
         files = self._files.get(sequence, ())
         if not files:
@@ -187,7 +186,7 @@ class EvaluatedRuns:
     def sequences(self) -> tuple[str, ...]:
         return tuple(self._runs)
 
-    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> ScoredSequence:
         """Return the scores of a sequence's runs; raises DataError as a folder does, or where they have other terms."""
         terms = self._record.terms
         if terms.max_dt_s is not None:
@@ -218,8 +217,8 @@ class EvaluatedRuns:
 
 def _record(
     sequence: str, truth: tuple[str, str], runs: Mapping[str, RunRecord], align: Align, before: SequenceRecord | None
-) -> SequenceRecord:
-    """Return the scores of a sequence's runs, or why there are none, by file; ``truth`` is its place and its hash.
+) -> ScoredSequence:
+    """Return the scores of a sequence's runs, and why there are none, by file; ``truth`` is its place and its hash.
 
     Raises DataError where all failed, or any where a baseline is made of them.
     """
@@ -233,8 +232,8 @@ def _record(
         key: tuple(None if file in failed else run.metrics.get(key) for file, run in runs.items())
         for key in scored_metrics(align)
     }
-    record = SequenceRecord(sequence=sequence, truth=truth[0], truth_hash=truth[1], files=tuple(runs), scores=scores)
-    return record if before is None else CheckedRuns(**structs.asdict(record), failed=failed)
+    files = tuple(runs)
+    return SequenceRecord(sequence=sequence, truth=truth[0], truth_hash=truth[1], files=files, scores=scores), failed
 
 
 # Runs of a system on sequences, in a folder or scored before.
@@ -250,7 +249,7 @@ def new_trajectory_baseline(
     given: GivenRuns, align: Align, gap_s: float, made_by: Mapping[str, str], bound_percent: float = BOUND_PERCENT
 ) -> TrajectoryBaselineRecord:
     """Score every run there is; raises DataError for the first that cannot be used."""
-    sequences = tuple(given.scored(sequence, align, gap_s, None) for sequence in given.sequences)
+    sequences = tuple(given.scored(sequence, align, gap_s, None)[0] for sequence in given.sequences)
     # What has no value, as orientations beside a truth of positions, has no bound either.
     valued = {key for one in sequences for key, values in one.scores.items() if any(v is not None for v in values)}
     return TrajectoryBaselineRecord(
@@ -280,11 +279,10 @@ def check_trajectories(
     tests: list[Repeats] = []
     for before in baseline.sequences:
         try:
-            now = given.scored(before.sequence, baseline.align, baseline.gap_s, before)
+            now, failed = given.scored(before.sequence, baseline.align, baseline.gap_s, before)
         except DataError as error:
             verdicts.append(_verdict(before, "sequence", "missing", printable(one_line(str(error)))))
             continue
-        failed = now.failed if isinstance(now, CheckedRuns) else {}
         if failed:
             words = f"{len(failed)} of {len(now.files)} runs failed: {'; '.join(list(failed.values())[:_NAMED])}"
             verdicts.append(_verdict(before, "run", "regressed", words))

@@ -388,23 +388,22 @@ class EvaluationRecord(Struct, frozen=True, kw_only=True):
 
 
 def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
-    return EvaluationRecord(
+    sequences = [
+        of_attributes(
+            SequenceScored, one, sequence=name, truth=one.path.as_posix(), truth_hash=one.digest, poses=len(one.poses)
+        )
+        for name, one in evaluation.truths.items()
+    ]
+    return of_attributes(
+        EvaluationRecord,
+        evaluation,
         schema="vislam.evaluation/1",
         terms=of_attributes(TermsRecord, evaluation.terms),
         ranked_by=evaluation.ranked_by.key,
-        sequences=tuple(
-            SequenceScored(
-                sequence=name, truth=truth.path.as_posix(), truth_hash=truth.digest, poses=len(truth.poses),
-                duration_s=truth.duration_s, path_m=truth.path_m,
-            )
-            for name, truth in evaluation.truths.items()
-        ),
-        runs=evaluation.runs,
+        sequences=tuple(sequences),
         over_runs=tuple(evaluation.cells.values()),
-        leaderboard=evaluation.leaderboard,
-        paired=evaluation.paired,
-        notes=evaluation.notes,
-    )  # fmt: skip
+        figures=UNSET,
+    )
 
 
 # Reads an ``evaluation.json``; raises DataError, in one line with the place, where it is not one.

@@ -11,7 +11,7 @@ from concurrent.futures import CancelledError
 from typing import Any, ClassVar, Self, TypeVar
 
 from toolkit.errors import VislamError
-from toolkit.experiment.code_version import code_digest, numeric_versions
+from toolkit.experiment.outcome_store import code_digest, numeric_versions
 from toolkit.experiment.workers import LostUnit, Needs, Work
 from toolkit.progress import SILENT, Progress
 

@@ -95,16 +95,14 @@ class Recording:
         return cls(source, seed, noise=noise, **own, **others)
 
 
-_NO_RECORDING = Recording("")
-
-
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording as the estimators read it, the findings of the audit in it before, and the state they start from.
 
-    ``recording`` is what it was prepared from, ``data`` the SHA-256 of what its preparation began with, and ``whole``
-    the recording before it was cut; ``undecided`` has the faults that could not be judged, and why; ``measured`` is
-    what was measured of its noise, None where the settings state it; ``references`` are the runs of other systems.
+    ``recording`` is what it was prepared from, ``whole`` the repaired recording before it was cut, and ``data`` the
+    SHA-256 of it and of which part is used; ``undecided`` has the faults that could not be judged, and why;
+    ``measured`` is what was measured of its noise, None where the settings state it; ``references`` are the runs of
+    other systems.
     """
 
     recording: Recording
@@ -147,8 +145,9 @@ def prepare_once(recording: Recording) -> Prepared:
 
 
 def _for_audit(recording: Recording) -> Recording:
-    others = {name: getattr(_NO_RECORDING, name) for name in ("noise", "tracks", "start", "card", "faults")}
-    return replace(recording, **others)
+    """Return a recording whose fields that no audit depends on are the defaults."""
+    noise, tracks = DEFAULTS.noise, DEFAULTS.tracks
+    return replace(recording, noise=noise, tracks=tracks, start="measurements", card=False, faults=None)
 
 
 @lru_cache(maxsize=1)
@@ -174,7 +173,9 @@ def found_where_planted(recording: Recording, _progress: Progress = SILENT) -> t
 
 
 def _prepared(recording: Recording, audited: Audit) -> Prepared:
-    data, whole, requested = _data_hash(recording, audited.sequence), audited.sequence, recording
+    whole, requested = audited.sequence, recording
+    part = (recording.part, recording.max_frames, recording.duration_s)
+    data = hashlib.sha256(f"{whole.content_hash()}{part}".encode()).hexdigest()
     if recording.faults is not None:
         # Where a fault strikes is drawn within the part that is run.
         whole = planted(_cut(whole, recording), recording.faults, recording.seed)
@@ -192,12 +193,6 @@ def _prepared(recording: Recording, audited: Audit) -> Prepared:
     prior = STARTS[recording.start](sequence)
     findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
     return Prepared(requested, sequence, findings, prior, whole, data, audited.undecided, measured, card)
-
-
-def _data_hash(recording: Recording, repaired: Sequence) -> str:
-    """Return the SHA-256 of what preparation begins with: the repaired recording, and the part of it that is used."""
-    part = (recording.part, recording.max_frames, recording.duration_s)
-    return hashlib.sha256(f"{repaired.content_hash()}{part}".encode()).hexdigest()
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:

@@ -15,9 +15,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Request
+from toolkit.experiment.outcome_store import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.workers import usable_cpus
 from toolkit.files.documents import Json, reader
 from toolkit.noise import MeasuredNoise

@@ -17,8 +17,7 @@ from msgspec import Meta, Struct
 from toolkit.answers import Output
 from toolkit.audit import Finding, faults
 from toolkit.experiment.comparison import NEES, Comparison, Row
-from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near
-from toolkit.experiment.disagreement import too_far
+from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near, too_far
 from toolkit.experiment.statistics import ratio_of_means
 from toolkit.files.documents import rounded
 from toolkit.metrics import is_on_request, metrics_called, unavailable
