@@ -7,7 +7,7 @@ import pytest
 
 from toolkit.audit import Audit
 from toolkit.experiment import recording
-from toolkit.experiment.explanation import ERROR, GATE, Explanation, run_explanation
+from toolkit.experiment.explanation import GATE, Explanation, run_explanation
 from toolkit.experiment.pipeline import Plan
 from toolkit.settings.reading import settings_of
 
@@ -75,7 +75,7 @@ def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted, tm
     found = explanation_of(tmp_path, planted)
     assert {part.ingredient for part in found.parts} == {planted, "water", GATE}
     for part in found.parts:
-        for effect in (part.first, part.last):
-            (_, low, high), direct = effect.on_error.interval, PLANTED[planted] if part.ingredient == planted else 0.0
-            assert low <= direct <= high, part.ingredient
-            assert (ERROR in effect.shown) == (part.ingredient == planted)
+        for effect in (part.first_in, part.last_in):
+            factor = np.exp(PLANTED[planted]) if part.ingredient == planted else 1.0
+            assert effect.error.low <= factor <= effect.error.high, part.ingredient
+            assert effect.shown == (part.ingredient == planted)

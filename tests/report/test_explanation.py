@@ -9,17 +9,10 @@ import pytest
 
 from toolkit.experiment.comparison import Row
 from toolkit.experiment.contests import HELD_OUT, Advantage, Contest
+from toolkit.experiment.explanation import ContributionRecord, FactorRecord, IngredientRecord, VariantRecord
 from toolkit.experiment.units import Outcome
 from toolkit.registry import discover
-from toolkit.report.explanation import (
-    ContributionRecord,
-    ExplanationRecord,
-    FactorRecord,
-    IngredientRecord,
-    VariantRecord,
-    explanation_table,
-    in_words,
-)
+from toolkit.report.explanation import ExplanationRecord, explanation_table, in_words
 from toolkit.report.manifest import RecordingRecord, SeedsUsed
 from toolkit.report.messages import why_sentence
 

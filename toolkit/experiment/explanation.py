@@ -16,15 +16,16 @@ on that measure finds it.
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.answers import Output
 from toolkit.errors import EstimatorError
@@ -34,6 +35,7 @@ from toolkit.experiment.grid import Grid, Trial, prepared_case, run_grid
 from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.recording import Prepared
 from toolkit.experiment.statistics import LEVEL, Paired, holm
+from toolkit.files.documents import Count, rounded
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.progress import ProgressFor, silent
@@ -44,7 +46,11 @@ from toolkit.settings.reading import value_at
 Key = TypeVar("Key")
 EXCESS = "excess_pose"
 # What differences are taken of: the error, the variance beyond the Cramér-Rao bound, and the NEES.
-ERROR, VARIANCE = "error", "variance"
+ERROR: Literal["error"] = "error"
+Other = Literal["variance", "nees"]
+OTHERS: tuple[Other, ...] = ("variance", "nees")
+# Factors of more than this stand for any larger one, which a diverged run may have.
+_MOST = 1e6
 # With fewer seeds, or values of one recording, nothing is tested.
 FEWEST_SEEDS, _FEWEST_VALUES = 3, 2 * STRETCHES
 GATE, NOISE, FUTURE = "gate and loss", "measured noise", "the future"
@@ -62,14 +68,9 @@ class Variant:
     has: frozenset[str]
     without: tuple[str, ...] = ()
 
-    def __str__(self) -> str:
-        return called(self.name, self.without)
-
-
-def called(estimator: str, without: Iterable[str]) -> str:
-    """Return how an estimator without some ingredients is called."""
-    lacking = ", ".join(f"no {one.removeprefix('the ')}" for one in without)
-    return f"{estimator} ({lacking})" if lacking else estimator
+    @property
+    def record(self) -> "VariantRecord":
+        return VariantRecord(estimator=self.name, output=self.output, has=tuple(sorted(self.has)), without=self.without)
 
 
 class Edge(NamedTuple):
@@ -211,51 +212,88 @@ class Measure(NamedTuple):
     blocks: int | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Contribution:
-    """What an ingredient brings between two variants, by measure: the logarithm of that without it over that with it.
+class VariantRecord(Struct, frozen=True, kw_only=True):
+    """One kind of output of an estimator, what it has, and what of it was taken away."""
 
-    Under ``ok`` of ``runs`` seeds both ended well. ``shown`` has the measures that it changes by more than chance.
-    """
+    estimator: str
+    output: Output
+    has: tuple[str, ...]
+    without: tuple[str, ...]
 
-    edge: Edge
-    runs: int
-    ok: int
-    by: Mapping[str, Paired | None]
-    shown: frozenset[str] = frozenset()
+    def __str__(self) -> str:
+        lacking = ", ".join(f"no {one.removeprefix('the ')}" for one in self.without)
+        return f"{self.estimator} ({lacking})" if lacking else self.estimator
+
+
+class FactorRecord(Struct, frozen=True, kw_only=True):
+    """How many times as large a figure is without the ingredient as with it, with its 95 % interval."""
+
+    factor: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, one: Paired) -> "FactorRecord":
+        """Return the factor whose logarithm is given."""
+        most = math.log(_MOST)
+        factor, low, high = (rounded(math.exp(min(max(end, -most), most))) for end in one.interval)
+        return cls(factor=factor, low=low, high=high)
 
     @property
-    def on_error(self) -> Paired | None:
-        """Return the effect on the error."""
-        return self.by[ERROR]
+    def is_off(self) -> bool:
+        return not self.low <= 1.0 <= self.high
+
+    def inverse(self) -> "FactorRecord":
+        """Return how many times as large it is with the ingredient as without it."""
+        return FactorRecord(factor=1.0 / self.factor, low=1.0 / self.high, high=1.0 / self.low)
 
 
-@dataclass(frozen=True, eq=False)
-class Ingredient:
-    """An ingredient's effect first in and last in; both are one effect where there is one pair, None where none.
+class ContributionRecord(Struct, frozen=True, kw_only=True):
+    """What an ingredient brings between two variants; null is what is not known."""
 
-    ``order`` is how much more it brings first in, None unless that is more than chance.
-    """
+    less: VariantRecord
+    more: VariantRecord
+    distance: Annotated[Count, Meta(description="ingredients in which the pair differs from the estimator it tells of")]
+    runs: Count
+    ok: Annotated[Count, Meta(description="runs in which both ended well")]
+    shown: Annotated[bool, Meta(description="whether the error differs by more than chance, by Holm's test over all")]
+    error: FactorRecord | None
+    variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
+    nees: FactorRecord | None
+    also_shown: Annotated[tuple[Other, ...] | UnsetType, Meta(description="of the others, those beyond chance")] = UNSET
+
+    def shows(self, measure: str) -> bool:
+        return self.shown if measure == "error" else measure in (self.also_shown or ())
+
+
+class IngredientRecord(Struct, frozen=True, kw_only=True):
+    """An ingredient: what it brings the first estimator alone, and what the second loses without it."""
 
     ingredient: str
-    first: Contribution | None
-    last: Contribution | None
-    order: Paired | None = None
+    first_in: Annotated[ContributionRecord | None, Meta(description="null where no two variants differ in it alone")]
+    last_in: ContributionRecord | None
+    order_matters: Annotated[bool, Meta(description="whether the two differ by more than chance")]
+
+    @property
+    def effects(self) -> tuple[ContributionRecord, ...]:
+        """Return the effects first in and last in, one where both are of the same pair, none where there is none."""
+        if self.first_in is None or self.last_in is None:
+            return ()
+        same = (self.first_in.less, self.first_in.more) == (self.last_in.less, self.last_in.more)
+        return (self.first_in,) if same else (self.first_in, self.last_in)
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Two estimators, how much more accurate the second is, and what each ingredient brings, the most first.
+    """How much more accurate one of two estimators is, and what each ingredient brings, the most first.
 
     ``metric`` is the key of the error. ``gap`` compares the two themselves.
     """
 
-    start: Variant
-    goal: Variant
     grid: Grid
     metric: str
-    gap: Contribution
-    parts: tuple[Ingredient, ...]
+    gap: ContributionRecord
+    parts: tuple[IngredientRecord, ...]
 
     @property
     def over_seeds(self) -> bool:
@@ -317,33 +355,44 @@ def explained(found: Pairings, grid: Grid) -> Explanation:
         arrays = [series[key, one] for edge in edges for one in (edge.less, edge.more)]
         return None if not all(map(len, arrays)) else _paired(np.array(arrays), measures[key])
 
-    def effect(edge: Edge) -> Contribution:
+    def record(edge: Edge, beyond: Collection[str]) -> ContributionRecord:
         ended = zip(rows[edge.less].outcomes, rows[edge.more].outcomes, strict=True)
         ok = [less.status == more.status == "ok" for less, more in ended]
-        return Contribution(edge, len(ok), sum(ok), {key: difference(key, edge) for key in measures})
+        by = {key: FactorRecord.of(one) for key in measures if (one := difference(key, edge)) is not None}
+        return ContributionRecord(
+            less=edge.less.record,
+            more=edge.more.record,
+            distance=edge.distance,
+            runs=len(ok),
+            ok=sum(ok),
+            shown=ERROR in beyond,
+            error=by.get(ERROR),
+            variance=by.get("variance"),
+            nees=by.get("nees"),
+            also_shown=tuple(key for key in OTHERS if key in beyond),
+        )
 
     pairs = {name: pair for name, pair in found.edges.items() if pair is not None}
-    effects = _tested({edge: effect(edge) for pair in pairs.values() for edge in pair}, measures)
+    # A pair that stands for first and last is tested once.
+    edges = {(edge.less, edge.more): edge for pair in pairs.values() for edge in pair}
+    shown = {key: _found_by_holm({ends: difference(key, one) for ends, one in edges.items()}) for key in measures}
     orders = {name: difference(ERROR, *pair) for name, pair in pairs.items() if pair[0].less != pair[1].less}
     clear = _found_by_holm(orders)
-    parts = [
-        Ingredient(name, pair and effects[pair[0]], pair and effects[pair[1]], clear.get(name))
-        for name, pair in found.edges.items()
-    ]
-    gap = effect(Edge("", found.start, found.goal, 0, at=True))
-    return Explanation(found.start, found.goal, grid, metric, gap, tuple(sorted(parts, key=_size, reverse=True)))
 
+    def part(name: str, pair: tuple[Edge, Edge] | None) -> IngredientRecord:
+        first, last = (
+            one and record(one, {key for key, those in shown.items() if (one.less, one.more) in those})
+            for one in pair or (None, None)
+        )
+        return IngredientRecord(ingredient=name, first_in=first, last_in=last, order_matters=name in clear)
 
-def _tested(effects: Mapping[Edge, Contribution], measures: Iterable[str]) -> dict[Edge, Contribution]:
-    """Return effects with what the tests over all of them show; a pair that stands for first and last counts once."""
-    shown = {
-        key: _found_by_holm({(edge.less, edge.more): effect.by[key] for edge, effect in effects.items()})
-        for key in measures
-    }
-    return {
-        edge: replace(effect, shown=frozenset(key for key, pairs in shown.items() if (edge.less, edge.more) in pairs))
-        for edge, effect in effects.items()
-    }
+    def size(name: str) -> float:
+        effects = [one for edge in pairs.get(name, ()) if (one := difference(ERROR, edge)) is not None]
+        return sum(one.mean for one in effects) / len(effects) if effects else -math.inf
+
+    parts = [part(name, found.edges[name]) for name in sorted(found.edges, key=size, reverse=True)]
+    gap = record(Edge("", found.start, found.goal, 0, at=True), ())
+    return Explanation(grid, metric, gap, tuple(parts))
 
 
 def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:
@@ -352,18 +401,13 @@ def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:
     return {key: one for (key, one), p in zip(known.items(), adjusted, strict=True) if p <= LEVEL}
 
 
-def _size(part: Ingredient) -> float:
-    known = [effect.on_error.mean for effect in (part.first, part.last) if effect and effect.on_error]
-    return sum(known) / len(known) if known else -math.inf
-
-
 def _over_seeds(metric: str) -> dict[str, Measure]:
     def logs(key: str, beyond: float, row: Row) -> Array:
         values = np.array([np.nan if value is None else value for value in row.good_values(key)], dtype=float)
         with np.errstate(divide="ignore"):
             return np.asarray(np.log(beyond + values))
 
-    keys = {ERROR: (metric, 0.0), VARIANCE: (EXCESS, 1.0), NEES: (NEES, 0.0)}
+    keys = {ERROR: (metric, 0.0), "variance": (EXCESS, 1.0), "nees": (NEES, 0.0)}
     return {name: Measure(partial(logs, *key), np.mean, FEWEST_SEEDS) for name, key in keys.items()}
 
 
@@ -376,7 +420,7 @@ def _over_stretches(metric: str) -> dict[str, Measure]:
     of_error = ("heldout_px", _mean_log) if metric == HELD_OUT else ("drift_m", _log_rms)
     error = Measure(partial(values, of_error[0]), of_error[1], _FEWEST_VALUES, STRETCHES)
     nees = Measure(partial(values, "nees_pose"), _log_mean, _FEWEST_VALUES, STRETCHES)
-    return {ERROR: error, NEES: nees}
+    return {ERROR: error, "nees": nees}
 
 
 def _log_rms(values: Array) -> float:

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import Meta, Struct
 
-from toolkit.answers import Output
-from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
-from toolkit.experiment.explanation import ERROR, FEWEST_SEEDS, VARIANCE, Contribution, Explanation, Variant, called
-from toolkit.experiment.statistics import Paired
-from toolkit.files.documents import Count, reader, rounded
+from toolkit.experiment.explanation import (
+    FEWEST_SEEDS,
+    ContributionRecord,
+    Explanation,
+    FactorRecord,
+    IngredientRecord,
+    Other,
+)
+from toolkit.files.documents import reader
 from toolkit.metrics import metrics_called
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
 from toolkit.report.results_folder import Results, Shown
@@ -22,81 +26,11 @@ from toolkit.report.text import MISSING, Table, listed, number
 from toolkit.settings import changes_of
 
 Kind = Literal["added", "taken"]
-Other = Literal["variance", "nees"]
-# Factors of more than this stand for any larger one, which a diverged run may have.
-_MOST = 1e6
 _DIGITS = 3
-_KEYS: dict[Other, str] = {"variance": VARIANCE, "nees": NEES}
 # So many ingredients a sentence names; the table has all.
 _MOST_NAMED = 3
 # An effect of less than a hundredth may be certain, and is not worth a sentence.
 _LEAST_TOLD = 0.01
-
-
-class VariantRecord(Struct, frozen=True, kw_only=True):
-    """One kind of output of an estimator, what it has, and what of it was taken away."""
-
-    estimator: str
-    output: Output
-    has: tuple[str, ...]
-    without: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return called(self.estimator, self.without)
-
-
-class FactorRecord(Struct, frozen=True, kw_only=True):
-    """How many times as large a figure is without the ingredient as with it, with its 95 % interval."""
-
-    factor: float
-    low: float
-    high: float
-
-    @property
-    def is_off(self) -> bool:
-        return not self.low <= 1.0 <= self.high
-
-    def inverse(self) -> "FactorRecord":
-        """Return how many times as large it is with the ingredient as without it."""
-        return FactorRecord(factor=1.0 / self.factor, low=1.0 / self.high, high=1.0 / self.low)
-
-    def range(self) -> str:
-        return f"{number(self.low, _DIGITS)} to {number(self.high, _DIGITS)}"
-
-
-class ContributionRecord(Struct, frozen=True, kw_only=True):
-    """What an ingredient brings between two variants; null is what is not known."""
-
-    less: VariantRecord
-    more: VariantRecord
-    distance: Annotated[Count, Meta(description="ingredients in which the pair differs from the estimator it tells of")]
-    runs: Count
-    ok: Annotated[Count, Meta(description="runs in which both ended well")]
-    shown: Annotated[bool, Meta(description="whether the error differs by more than chance, by Holm's test over all")]
-    error: FactorRecord | None
-    variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
-    nees: FactorRecord | None
-    also_shown: Annotated[tuple[Other, ...] | UnsetType, Meta(description="of the others, those beyond chance")] = UNSET
-
-    def shows(self, measure: str) -> bool:
-        return self.shown if measure == "error" else measure in (self.also_shown or ())
-
-
-class IngredientRecord(Struct, frozen=True, kw_only=True):
-    """An ingredient: what it brings the first estimator alone, and what the second loses without it."""
-
-    ingredient: str
-    first_in: Annotated[ContributionRecord | None, Meta(description="null where no two variants differ in it alone")]
-    last_in: ContributionRecord | None
-    order_matters: Annotated[bool, Meta(description="whether the two differ by more than chance")]
-
-    @property
-    def effects(self) -> tuple[ContributionRecord, ...]:
-        """Return the effects first in and last in, one where both are of the same pair, none where there is none."""
-        if self.first_in is None or self.last_in is None:
-            return ()
-        same = (self.first_in.less, self.first_in.more) == (self.last_in.less, self.last_in.more)
-        return (self.first_in,) if same else (self.first_in, self.last_in)
 
 
 class ExplanationRecord(Struct, frozen=True, kw_only=True):
@@ -133,46 +67,12 @@ def explanation_document(
         intervals="seeds" if found.over_seeds else "stretches",
         metric=found.metric,
         words="",
-        gap=_effect(found.gap),
-        parts=tuple(
-            IngredientRecord(
-                ingredient=part.ingredient,
-                first_in=None if part.first is None else _effect(part.first),
-                last_in=None if part.last is None else _effect(part.last),
-                order_matters=part.order is not None,
-            )
-            for part in found.parts
-        ),
+        gap=found.gap,
+        parts=found.parts,
         figures=figures or {},
         files=files,
     )
     return msgspec.structs.replace(record, words=in_words(record))
-
-
-def _effect(effect: Contribution) -> ContributionRecord:
-    by = {key: None if one is None else _factor_record(one) for key, one in effect.by.items()}
-    return ContributionRecord(
-        less=_variant(effect.edge.less),
-        more=_variant(effect.edge.more),
-        distance=effect.edge.distance,
-        runs=effect.runs,
-        ok=effect.ok,
-        shown=ERROR in effect.shown,
-        error=by[ERROR],
-        variance=by.get(VARIANCE),
-        nees=by.get(NEES),
-        also_shown=tuple(name for name, key in _KEYS.items() if key in effect.shown),
-    )
-
-
-def _variant(one: Variant) -> VariantRecord:
-    return VariantRecord(estimator=one.name, output=one.output, has=tuple(sorted(one.has)), without=one.without)
-
-
-def _factor_record(one: Paired) -> FactorRecord:
-    most = math.log(_MOST)
-    factor, low, high = (rounded(math.exp(min(max(end, -most), most))) for end in one.interval)
-    return FactorRecord(factor=factor, low=low, high=high)
 
 
 def in_words(found: ExplanationRecord) -> str:
@@ -188,13 +88,17 @@ def _gap(found: ExplanationRecord) -> str:
         takes = f"it takes {FEWEST_SEEDS} seeds" if found.intervals == "seeds" else "it takes a longer stretch of path"
         return f"{on} {start} and {goal} cannot be compared: {ended}, and {takes}."
     if not gap.is_off:
-        return f"{on} {over(found)} show no difference of {error_of(found)} between {start} and {goal} ({gap.range()})."
+        return f"{on} {over(found)} show no difference of {error_of(found)} between {start} and {goal} ({_range(gap)})."
     better, worse, by = (goal, start, gap) if gap.factor > 1.0 else (start, goal, gap.inverse())
     does = "predicts withheld tracks" if found.metric == HELD_OUT else "is"
     claim = (
         f"{does} {number(by.factor, _DIGITS)} times as {'well' if found.metric == HELD_OUT else 'accurate'} as {worse}"
     )
-    return f"{on} {better} {claim} ({by.range()} with 95 % confidence; {error_of(found)}, {over(found)})."
+    return f"{on} {better} {claim} ({_range(by)} with 95 % confidence; {error_of(found)}, {over(found)})."
+
+
+def _range(one: FactorRecord) -> str:
+    return f"{number(one.low, _DIGITS)} to {number(one.high, _DIGITS)}"
 
 
 def over(found: ExplanationRecord) -> str:
@@ -242,7 +146,7 @@ def _clause(effect: ContributionRecord, kind: Kind, tests: int) -> str:
     if effect.error is None:
         return f"{at}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
     if not (effect.shown or effect.error.is_off):
-        return f"{at}, nothing is shown ({effect.error.range()})"
+        return f"{at}, nothing is shown ({_range(effect.error)})"
     change_told = _size_told(effect.error if kind == "added" else effect.error.inverse())
     if effect.shown:
         return f"{at}, the error becomes {change_told}"
@@ -270,7 +174,7 @@ def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
 def _size_told(change: FactorRecord, where: str = "") -> str:
     """Return how many times smaller or larger something is with an ingredient, whose effect is given."""
     size, by = ("smaller", change) if change.factor > 1.0 else ("larger", change.inverse())
-    return f"{number(by.factor, _DIGITS)} times {size} {where}({by.range()})"
+    return f"{number(by.factor, _DIGITS)} times {size} {where}({_range(by)})"
 
 
 def _not_shown(found: ExplanationRecord) -> Iterator[str]:
@@ -313,7 +217,7 @@ def _where_likely(found: ExplanationRecord, parts: Sequence[IngredientRecord]) -
     texts = []
     for part in parts:
         ends = [(of_second, one.error) for of_second, _, one in placed(found, part) if one.error and one.error.is_off]
-        ranges = [f"{error.range()} near {found.gap.more if last else found.gap.less}" for last, error in ends]
+        ranges = [f"{_range(error)} near {found.gap.more if last else found.gap.less}" for last, error in ends]
         texts.append(f"{part.ingredient} ({', '.join(ranges)})")
     return listed(texts, len(texts))
 
@@ -324,7 +228,7 @@ def _listed(parts: Sequence[IngredientRecord]) -> str:
     for part in parts:
         known = [one.error for one in part.effects if one.error]
         whole = FactorRecord(factor=1.0, low=min(e.low for e in known), high=max(e.high for e in known))
-        texts.append(f"{part.ingredient} ({whole.range()})")
+        texts.append(f"{part.ingredient} ({_range(whole)})")
     return listed(texts, len(texts))
 
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, over, placed, where
+from toolkit.experiment.explanation import ContributionRecord
+from toolkit.report.explanation import ExplanationRecord, Kind, over, placed, where
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
