@@ -73,8 +73,11 @@ WRONG: list[tuple[str, int, str]] = [
     ("baseline nowhere.npz --out new.json", 3, "nowhere.npz: no such file"),
     ("baseline drive:soon --out new.json", 3, "drive:soon: no such file"),
     ("baseline drive --out t", 4, "t is a directory"),
+    ("baseline drive --out gt.tum", 4, "gt.tum is a file of another kind, which would be lost"),
     ("baseline drive --estimators oracle --out new.json", 5, "no estimator is called oracle"),
-    ("check --baseline broken.toml --skip-speed --json t", 4, "t is a directory"),  # before anything is read
+    # Before anything is read:
+    ("check --baseline broken.toml --skip-speed --json t", 4, "t is a directory"),
+    ("check --baseline broken.toml --junit new.xml --json gt.tum", 4, "gt.tum is a file of another kind"),
     # Recordings, trajectories, and what does not go together.
     ("compare no/such.npz", 3, "no/such.npz: no such file or directory"),
     ("compare run", 3, "is a run directory and no recording: vislam report shows it, and --config run/manifest.json"),

@@ -140,10 +140,10 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vis
 GIVEN, BASE = "check --trajectories results --baseline", "check --trajectories results --baseline base.json"
 
 
+# What names nothing, or the wrong thing, is in tests/cli/test_advice.py.
 @pytest.mark.parametrize(
     ("words", "status", "wanted"),
     [
-        ("check --trajectories nowhere --baseline base.json", 3, "nowhere: it is no folder"),
         ("check --trajectories empty --baseline base.json", 3, "no SEQUENCE.tum"),
         (f"{GIVEN} spoilt.json", 3, "bounds.ate_yaw_m is not among"),
         (f"{GIVEN} truth/lap.tum", 3, "cannot be read as JSON"),
@@ -151,10 +151,6 @@ GIVEN, BASE = "check --trajectories results --baseline", "check --trajectories r
         ("check --baseline base.json --truth truth", 2, "--truth goes with --trajectories"),
         ("check --baseline empty", 3, "empty: it holds no baseline (*.json); make the baseline with"),
         (f"{BASE} --truth lop=truth/lap.tum", 3, "--truth names the truth of lop: no sequence is called lop (did you"),
-        (f"{BASE} --truth lap=truth/lop.tum", 3, "--truth lap=truth/lop.tum: there is no such file; check the path"),
-        (f"{BASE} --junit same --json ./same", 2, "--junit and --json are files of their own"),
-        ("baseline --trajectories results --truth results", 3, "results: it has 5 truths for maze"),
-        ("baseline --trajectories truth --truth truth --plan", 3, "no sequence has 3 runs"),
         ("baseline drive --trajectories results", 2, "--trajectories takes no SEQUENCE"),
         ("baseline drive --gap 3", 2, "--gap, --bound and --plan go with --trajectories"),
     ],

@@ -42,8 +42,6 @@ def _run(document):
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
-        (lambda d: d.update(schema="vislam.baseline/9"), "its schema is 'vislam.baseline/9'"),
-        (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"), "'smaller', only away from 1, la"),
         (lambda d: d["sequences"][0].update(seeds=[0, 0]), "seeds"),
         (lambda d: d["sequences"][0]["hashes"].pop(), "hashes"),
         (lambda d: _run(d)["causal"]["ate_se3_m"].pop(), "ate_se3_m"),

@@ -2,14 +2,12 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 from msgspec import structs
 
 from tests.gate.conftest import as_measured, checked, edited, planted
-from toolkit.cli import main
 from toolkit.report.gate import BEGINNINGS, WRITERS, gate_markdown, gate_text, write_check
 from toolkit.report.records import read_check
 
@@ -93,21 +91,3 @@ def test_every_kind_of_file_begins_as_it_is_set_to_and_markdown_tables_are_well_
         assert all(set(cell.strip()) <= set(":-") for cell in table[1].strip("|").split("|"))
     assert len(tables[-1]) == 2 + len(check.verdicts)
     assert text.count("<details>") == text.count("</details>") == 1
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["baseline", "drive:1", "--estimators", "dead-reckoning", "--seeds", "5", "--out", "notes"],
-        ["check", "--baseline", "base.json", "--junit", "notes"],
-        ["check", "--baseline", "base.json", "--junit", "new.xml", "--json", "notes"],
-    ],
-)
-def test_a_file_of_another_kind_is_in_the_way_before_anything_runs(words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("toolkit.gate.checking.new_baseline", None)
-    monkeypatch.setattr("toolkit.cli.gate._check_of_estimators", None)
-    Path("notes").write_text("mine")
-    assert main(words) == 4
-    assert "notes is a file of another kind, which would be lost" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
