@@ -10,23 +10,15 @@ from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PosePath3D
 from evo.tools import file_interface
 
+from tests.evaluation.conftest import START_NS, S, poses_at
 from toolkit.datasets.trajectories import euroc, kitti, tum
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.scoring import Terms, read_truth, score_file
-from toolkit.geometry import Array, IntArray, about_z, se3, se3_exp, so3_exp
+from toolkit.geometry import Array, IntArray, se3_exp
 
 # Files print 15 digits; what is left is the order of sums over a few hundred poses.
 TOLERANCE = 1e-9
-START_NS, S = 1_403_636_579_758_555_392, 10**9
 POSITION, ANGLE_DEG = PoseRelation.translation_part, PoseRelation.rotation_angle_deg
-
-
-def poses_at(t_ns: IntArray) -> Array:
-    """A hilly drive of 300 m in 60 s (N, 4, 4)."""
-    s = 5.0 * (t_ns - START_NS) / S
-    heading = 0.4 * np.sin(s / 30.0) + 0.3
-    positions = np.stack([s * np.cos(0.3), 20.0 * np.sin(s / 40.0), 3.0 * np.sin(s / 25.0)], axis=-1)
-    return se3(about_z(heading) @ so3_exp(np.stack([0.05 * np.sin(s), 0.05 * np.cos(s), 0.0 * s], -1)), positions)
 
 
 def drifted(t_ns: IntArray) -> Array:
