@@ -96,12 +96,12 @@ class TwistFactors:
 
     @classmethod
     def of(cls, increments: Mapping[int, TwistIncrement]) -> Self:
-        steps = [increment.step for increment in increments.values()]
+        steps = list(increments.values())
         return cls(
             np.array(list(increments), dtype=np.int64),
             np.array([step.T_start_end for step in steps]),
             np.array([step.d_step_d_bias for step in steps]),
-            np.array([increment.gyro_bias for increment in increments.values()]),
+            np.array([step.gyro_bias for step in steps]),
             np.linalg.inv(np.linalg.cholesky(np.array([step.cov for step in steps]))),
         )
 
@@ -195,7 +195,7 @@ class FirstImages:
 
 @dataclass(frozen=True)
 class Stopping:
-    """When to stop: at a small decrease of the error, absolute or relative to it, or after too many iterations.
+    """When to stop: at a small decrease of the error relative to it, or after too many iterations.
 
     ``at_overshoot`` is for a solve that need not reach the minimum: it ends at the first step that raises the error
     after one that lowered it, because damping that step until it lowers the error takes an elimination for each
@@ -205,7 +205,6 @@ class Stopping:
 
     relative_decrease: float = 1e-5
     max_iterations: int = 50
-    decrease: float = _LEAST_DECREASE
     at_overshoot: bool = False
     enough: float = 0.0
 
@@ -266,7 +265,7 @@ def solve(
             if landmarks is not None:
                 # That step's damping does not show how near the minimum is, so it never ends the solve.
                 in_images, here, gained = landmarks, here._replace(damping=_DAMPING_IN_IMAGES), np.inf
-        if gained <= max(stopping.relative_decrease * here.error, stopping.decrease):
+        if gained <= max(stopping.relative_decrease * here.error, _LEAST_DECREASE):
             return Solution(here.values, here.error, iteration, True, overshot)
     enough = gained <= stopping.enough * here.error
     return Solution(here.values, here.error, stopping.max_iterations, enough, overshot)

@@ -38,27 +38,16 @@ def preintegration_params(noise: ImuNoise, gravity_world: Array) -> gtsam.Preint
 
 
 def preintegrate(motion: ImuMotion, bias: Array, params: gtsam.PreintegrationCombinedParams) -> Preintegration:
-    """Preintegrate one interval about a bias (6,) [accel, gyro]."""
-    return _preintegrated(motion, accel_at_start(motion.dt_s, motion.accel_mps2, motion.gyro_radps, bias), bias, params)
-
-
-def accel_at_start(dt_s: Array, accel_mps2: Array, gyro_radps: Array, bias: Array) -> Array:
-    """Return specific forces (N, 3) of the middle of steps (N,) s in the axes of their starts; bias (6,) or (N, 6).
+    """Preintegrate one interval about a bias (6,) [accel, gyro].
 
     GTSAM rotates each specific force by the attitude at the start of its step. The samples here are for the middle of
     the step, so they are first rotated by half the step's rotation. That makes the integration second order: 20 s of a
     200 Hz flight drift by 1 mm instead of 9 cm.
     """
-    of_accel, of_gyro = bias[..., :3], bias[..., 3:]
-    half_turns = so3_exp(0.5 * dt_s[:, None] * (gyro_radps - of_gyro))
-    return np.asarray((half_turns @ (accel_mps2 - of_accel)[..., None])[..., 0] + of_accel)
-
-
-def _preintegrated(
-    motion: ImuMotion, accel_mps2: Array, bias: Array, params: gtsam.PreintegrationCombinedParams
-) -> Preintegration:
+    half_turns = so3_exp(0.5 * motion.dt_s[:, None] * (motion.gyro_radps - bias[3:]))
+    at_start = (half_turns @ (motion.accel_mps2 - bias[:3])[..., None])[..., 0] + bias[:3]
     preintegration = Preintegration(params, constant_bias(bias))
-    for accel, gyro, dt_s in zip(accel_mps2, motion.gyro_radps, motion.dt_s.tolist(), strict=True):
+    for accel, gyro, dt_s in zip(at_start, motion.gyro_radps, motion.dt_s.tolist(), strict=True):
         preintegration.integrateMeasurement(accel, gyro, dt_s)
     return preintegration
 
@@ -125,20 +114,6 @@ class ImuModel(MotionModel):
         assert isinstance(motion, ImuMotion)
         preintegration = preintegrate(motion, bias, self._params_over(motion))
         return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
-
-    def predict_each(self, motions: list[Motion], starts: Belief) -> Prediction:
-        """Predict S stacked states over an interval each, with the samples of all turned to their starts at once."""
-        measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
-        samples = [(motion.dt_s, motion.accel_mps2, motion.gyro_radps) for motion in measured]
-        counts, biases = [motion.dt_s.size for motion in measured], starts.bias
-        dt_s, accels_mps2, gyros_radps = (np.concatenate(part) for part in zip(*samples, strict=True))
-        at_start = accel_at_start(dt_s, accels_mps2, gyros_radps, np.repeat(biases, counts, axis=0))
-        accels = np.split(at_start, np.cumsum(counts)[:-1])
-        each = []
-        for k, (motion, accel_mps2) in enumerate(zip(measured, accels, strict=True)):
-            preintegration = _preintegrated(motion, accel_mps2, biases[k], self._params_over(motion))
-            each.append(predict(preintegration, starts.T_world_imu[k], starts.v_world[k], biases[k]))
-        return Prediction(*(np.stack(part) for part in zip(*each, strict=True)))
 
     def _params_over(self, motion: ImuMotion) -> gtsam.PreintegrationCombinedParams:
         """Return the parameters over an interval; a preintegration has one noise, the mean over a bridged piece."""

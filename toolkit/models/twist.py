@@ -12,7 +12,6 @@ robotics" (2017), eq. 3.202: white noise on acceleration).
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -33,8 +32,9 @@ from toolkit.models.graph_state import MotionModel
 from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, Prediction
 
 
-class TwistStep(NamedTuple):
-    """The relative motion of one interval and its first-order error.
+@dataclass(frozen=True, eq=False)
+class TwistIncrement:
+    """The relative motion of one interval, integrated about a gyro bias (3,), and its first-order error.
 
     ``T_start_end`` (4, 4); ``d_step_d_bias`` (6, 3), the Jacobian of the step's end (right perturbation) to the gyro
     bias; ``cov`` (6, 6), the covariance of the step in the tangent of its end, from the noise of the twist alone;
@@ -45,9 +45,33 @@ class TwistStep(NamedTuple):
     d_step_d_bias: Array
     cov: Array
     dt_s: float | Array
+    gyro_bias: Array
+    noise: TwistNoise
+
+    def predict(self, start: Belief) -> Prediction:
+        size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
+        transition, noise = np.zeros((2, *self.cov.shape[:-2], size, size))
+        transition[..., POSE, POSE] = se3_adjoint(se3_inverse(self.T_start_end))
+        transition[..., POSE, gyro_bias] = self.d_step_d_bias
+        transition[..., gyro_bias, gyro_bias] = np.eye(3)
+        noise[..., POSE, POSE] = self.cov
+        noise[..., gyro_bias, gyro_bias] = bias_walk_cov(self.noise, self.dt_s)
+        return Prediction(start.T_world_imu @ self.T_start_end, start.v_world, transition, noise)
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        transition = end.transition.copy()
+        transition[POSE, POSE] = se3_adjoint(se3_inverse(end.T_world_imu) @ start.T_world_imu)
+        return transition
+
+    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(twist_factor(self, k))
+        walk = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(self.noise, self.dt_s))
+        graph.add(gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), walk))
+        return graph
 
 
-def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
+def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistIncrement:
     """Integrate the twists of one interval, piece by piece, with a gyro bias (3,) rad/s subtracted.
 
     Several intervals of equally many twists are integrated at once, where all arrays have one axis more in front.
@@ -69,7 +93,7 @@ def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> Twist
         T_start_end = T_start_end @ piece
         d_step_d_bias = carry @ d_step_d_bias + own_by_bias
         cov = carry @ cov @ carry.mT + own_cov
-    return TwistStep(T_start_end, d_step_d_bias, cov, motion.dt_s.sum(axis=-1))
+    return TwistIncrement(T_start_end, d_step_d_bias, cov, motion.dt_s.sum(axis=-1), gyro_bias, noise)
 
 
 def bias_walk_cov(noise: TwistNoise, dt_s: float | Array) -> Array:
@@ -77,14 +101,13 @@ def bias_walk_cov(noise: TwistNoise, dt_s: float | Array) -> Array:
     return np.asarray(dt_s)[..., None, None] * np.diag(noise.gyro_random_walk**2)
 
 
-def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFactor:
+def twist_factor(step: TwistIncrement, k: int) -> gtsam.NonlinearFactor:
     """Return the factor from pose X(k - 1) and gyro bias B(k - 1) (3,) to pose X(k).
 
-    The residual is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``. ``step``
-    was integrated with the bias ``step_bias`` (3,); the change with another bias is first order, as in a
-    preintegration.
+    The residual is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``; its change with
+    another bias than the step's is first order, as in a preintegration.
     """
-    predicted, d_step_d_bias = gtsam.Pose3(step.T_start_end), step.d_step_d_bias
+    predicted, d_step_d_bias, step_bias = gtsam.Pose3(step.T_start_end), step.d_step_d_bias, step.gyro_bias
     noise = gtsam.noiseModel.Gaussian.Covariance(step.cov)
 
     def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -105,37 +128,6 @@ def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFa
     return gtsam.CustomFactor(noise, [X(k - 1), X(k), B(k - 1)], residual)
 
 
-@dataclass(frozen=True, eq=False)
-class TwistIncrement:
-    """The step between two frames, or several, and the gyro bias (..., 3) it was integrated about."""
-
-    step: TwistStep
-    gyro_bias: Array
-    noise: TwistNoise
-
-    def predict(self, start: Belief) -> Prediction:
-        size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
-        transition, noise = np.zeros((2, *self.step.cov.shape[:-2], size, size))
-        transition[..., POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
-        transition[..., POSE, gyro_bias] = self.step.d_step_d_bias
-        transition[..., gyro_bias, gyro_bias] = np.eye(3)
-        noise[..., POSE, POSE] = self.step.cov
-        noise[..., gyro_bias, gyro_bias] = bias_walk_cov(self.noise, self.step.dt_s)
-        return Prediction(start.T_world_imu @ self.step.T_start_end, start.v_world, transition, noise)
-
-    def transition_between(self, start: Belief, end: Prediction) -> Array:
-        transition = end.transition.copy()
-        transition[POSE, POSE] = se3_adjoint(se3_inverse(end.T_world_imu) @ start.T_world_imu)
-        return transition
-
-    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(twist_factor(self.step, self.gyro_bias, k))
-        walk = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(self.noise, self.step.dt_s))
-        graph.add(gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), walk))
-        return graph
-
-
 class TwistModel(MotionModel):
     """Pose and gyro bias, moved by a measured twist."""
 
@@ -147,7 +139,7 @@ class TwistModel(MotionModel):
     def integrate(self, motion: Motion, bias: Array) -> TwistIncrement:
         """Integrate the twists between two frames about a bias (6,), of which only the gyro's part is used."""
         assert isinstance(motion, TwistMotion)
-        return TwistIncrement(integrate(motion, bias[..., 3:], self._noise), bias[..., 3:], self._noise)
+        return integrate(motion, bias[..., 3:], self._noise)
 
     def predict_each(self, motions: list[Motion], starts: Belief) -> Prediction:
         """Predict S stacked states over an interval each, at once over those of equally many twists."""
