@@ -133,16 +133,6 @@ def test_windowed_filters_weigh_a_sighting_in_view_and_later_its_track_by_the_co
         assert pulled[6.0] < NOTHING_M
 
 
-@pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_what_the_other_tracks_contradict_is_an_outlier_though_the_motion_allows_it(scene, run_estimator, name):
-    """Off by 9.5 sigma: after a motion that is known half as well the gate alone would let it pass."""
-    sequence = scene.with_error(9.5)
-    doubtful = sequence.noise.scaled(2.0)
-    settings = Settings(outliers=POLICIES["classic"])
-    for known_so_well in (sequence, replace(sequence, noise=doubtful)):
-        assert scene.error_m(run_estimator(name, known_so_well, settings=settings)) < NOTHING_M
-
-
 @pytest.mark.parametrize(("share", "believed"), [(0.4, False), (0.6, True)])
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2"])
 def test_where_most_tracks_disagree_none_is_an_outlier(scene, run_estimator, name, share, believed):
