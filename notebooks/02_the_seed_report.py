@@ -32,7 +32,7 @@ from toolkit.answers import Run
 from toolkit.audit import Audit, audit, faults
 from toolkit.datasets import load_sequence
 from toolkit.models.camera_motion import camera_motion
-from toolkit.report.comparison_text import audit_text
+from toolkit.report.card import audit_text
 from toolkit.sequence import Sequence
 
 # %matplotlib inline

@@ -30,7 +30,7 @@ from toolkit import Result, compare, explain
 from toolkit.noise import Card
 from toolkit.registry import ladder
 from toolkit.report.card import card_lines
-from toolkit.report.comparison_table import noise_line
+from toolkit.report.headers import noise_line
 from toolkit.report.messages import consistency_lines
 
 # %matplotlib inline

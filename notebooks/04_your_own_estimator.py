@@ -34,8 +34,7 @@ from toolkit.measurements import Packet, StereoFrame
 from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
 from toolkit.progress import SILENT, silent
-from toolkit.report.comparison_text import verification_text
-from toolkit.report.gate import gate_text
+from toolkit.report.gate import gate_text, verification_text
 from toolkit.runner import run
 from toolkit.verify import subject_of, verify
 

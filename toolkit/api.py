@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, NoReturn, TypedDict, TypeVar, Unpack, get_args
 
 import numpy as np
 from msgspec import Meta
@@ -32,16 +32,11 @@ from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.metrics import describe
 from toolkit.progress import silent
 from toolkit.registry import discover, find_all
-from toolkit.report.comparison_table import Columns, comparison_table, requested_columns
-from toolkit.report.comparison_text import comparison_latex
-from toolkit.report.explanation import (
-    EXPLANATIONS,
-    ExplanationRecord,
-    explanation_document,
-    explanation_table,
-    write_explanation,
-)
-from toolkit.report.sweep import SWEEPS, sweep_document, sweep_table, write_sweep
+from toolkit.report.comparison_table import comparison_latex, comparison_table
+from toolkit.report.explanation import EXPLANATIONS, ExplanationRecord
+from toolkit.report.headers import Columns, requested_columns
+from toolkit.report.run_directory import MadeBy, Results, write_run
+from toolkit.report.sweep import SWEEPS, SweepRecord
 from toolkit.report.text import WIDTH, Table, as_markdown, as_text, in_markdown
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
@@ -56,6 +51,8 @@ if TYPE_CHECKING:
 
 Source = str | Path | Sequence
 Names = str | Iterable[str]
+Found = TypeVar("Found")
+Document = TypeVar("Document")
 
 
 class _Asked(Request, frozen=True):
@@ -307,7 +304,6 @@ class Result:
         Raises OutputError where it cannot be written, SettingsError where there are no such figures.
         """
         from toolkit.report.figures import FigureChoice, FigureFormat
-        from toolkit.report.run_directory import MadeBy, write_run
 
         for what, value, known in (("figures", figures, FigureChoice), ("figure_format", figure_format, FigureFormat)):
             if value not in get_args(known):
@@ -325,43 +321,6 @@ class Result:
         return self.table()._repr_markdown_()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SweepResult:
-    """What a sweep found: an iterable of the rows of its long table, as pandas takes them. ``sweep`` has the values.
-
-    A row has the sequence, a column an axis, seed, estimator, output, metric, value and status.
-    """
-
-    sweep: Sweep
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        return self.sweep.records()
-
-    def table(self) -> "ShownTable":
-        """Return errors over the clean ones with their intervals, and the dose at which each estimator breaks."""
-        return ShownTable(sweep_table(sweep_document(self.sweep)))
-
-    @cached_property
-    def figures(self) -> Mapping[str, "Figure"]:
-        """The figures by name."""
-        from toolkit.report.figures.sweeps import draw_sweep
-
-        return {figure.name: figure.figure for figure in draw_sweep(self.sweep)}
-
-    def save(self, directory: str | Path) -> Path:
-        """Write the directory that ``vislam sweep`` writes; raises OutputError where it cannot be written."""
-        from toolkit.report.figures.sweeps import draw_sweep
-
-        write_sweep(self.sweep, Path(directory), "toolkit.sweep", list(draw_sweep(self.sweep)))
-        return Path(directory)
-
-    def __repr__(self) -> str:
-        return SWEEPS.text(sweep_document(self.sweep))
-
-    def _repr_markdown_(self) -> str:
-        return self.table()._repr_markdown_()
-
-
 def _checked_columns(columns: tuple[str, ...]) -> Columns:
     strange = [column for column in columns if not isinstance(column, str)]
     if strange:
@@ -370,42 +329,76 @@ def _checked_columns(columns: tuple[str, ...]) -> Columns:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ExplainResult:
-    """Why one estimator is more accurate than another. ``explanation`` holds the values themselves."""
+class _OfTrials(Generic[Found, Document]):
+    """What was found by many trials, and how it is shown: as a document, a table, figures and a folder."""
 
-    explanation: Explanation
+    found: Found
+    _kind: ClassVar[Results[Any, Any]]
+    _command: ClassVar[str]
 
     @cached_property
-    def document(self) -> ExplanationRecord:
-        """What ``explain.json`` has."""
-        return explanation_document(self.explanation, "toolkit.explain")
+    def document(self) -> Document:
+        """What the document of the folder has."""
+        made: Document = self._kind.made(self.found, self._command, {}, ())
+        return made
+
+    def table(self) -> "ShownTable":
+        """Return the table that the command prints."""
+        return ShownTable(self._kind.shown(self.document).table)
+
+    @cached_property
+    def figures(self) -> Mapping[str, "Figure"]:
+        """The figures by name."""
+        return {one.name: one.figure for one in self._kind.drawn(self.found)}
+
+    def save(self, directory: str | Path) -> Path:
+        """Write the directory that the command writes; raises OutputError where it cannot be written."""
+        self._kind.write(self.found, Path(directory), self._command)
+        return Path(directory)
+
+    def __repr__(self) -> str:
+        return self._kind.text(self.document, WIDTH)
+
+    def _repr_markdown_(self) -> str:
+        return self.table()._repr_markdown_()
+
+
+class SweepResult(_OfTrials[Sweep, SweepRecord]):
+    """What a sweep found: an iterable of the rows of its long table, as pandas takes them. ``sweep`` has the values.
+
+    A row has the sequence, a column an axis, seed, estimator, output, metric, value and status. Its table has errors
+    over the clean ones with their intervals, and the dose at which each estimator breaks.
+    """
+
+    _kind, _command = SWEEPS, "toolkit.sweep"
+
+    @property
+    def sweep(self) -> Sweep:
+        return self.found
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return self.sweep.records()
+
+
+class ExplainResult(_OfTrials[Explanation, ExplanationRecord]):
+    """Why one estimator is more accurate than another. ``explanation`` holds the values themselves.
+
+    Its table has the effect of every ingredient with its intervals.
+    """
+
+    _kind, _command = EXPLANATIONS, "toolkit.explain"
+
+    @property
+    def explanation(self) -> Explanation:
+        return self.found
 
     @property
     def words(self) -> str:
         """The explanation in sentences."""
         return self.document.words
 
-    def table(self) -> "ShownTable":
-        """Return the effect of every ingredient with its intervals."""
-        return ShownTable(explanation_table(self.document))
-
-    @cached_property
-    def figures(self) -> Mapping[str, "Figure"]:
-        """The figure by its name, ``waterfall``."""
-        from toolkit.report.figures.waterfall import draw_explanation
-
-        return {figure.name: figure.figure for figure in draw_explanation(self.document)}
-
-    def save(self, directory: str | Path) -> Path:
-        """Write the directory that ``vislam explain`` writes; raises OutputError where it cannot be written."""
-        write_explanation(self.explanation, Path(directory), "toolkit.explain")
-        return Path(directory)
-
-    def __repr__(self) -> str:
-        return EXPLANATIONS.text(self.document, WIDTH)
-
     def _repr_markdown_(self) -> str:
-        return f"{in_markdown(self.words)}\n\n{self.table()._repr_markdown_()}"
+        return f"{in_markdown(self.words)}\n\n{super()._repr_markdown_()}"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from toolkit.audit.timing import clock_change
 from toolkit.audit.truth import truth_clock, truth_mismatch
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
-from toolkit.report.comparison_text import audit_text
+from toolkit.report.card import audit_text
 from toolkit.sequence import Sequence
 from toolkit.simulation import faults
 

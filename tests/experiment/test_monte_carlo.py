@@ -14,7 +14,7 @@ from toolkit.experiment.units import Outcome
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.metrics.parts.consistency import nees_band
-from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.comparison_table import comparison_text, report_text
 from toolkit.report.messages import note_lines
 from toolkit.report.scores import Seeds, seeds_document
 

@@ -12,7 +12,7 @@ from toolkit.experiment.pipeline import Plan, run
 from toolkit.motion_samples import TwistSamples
 from toolkit.noise import card_of, measured_noise
 from toolkit.report.card import card_lines, card_record
-from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.comparison_table import comparison_text, report_text
 from toolkit.report.html.payload import payload_of
 from toolkit.report.records import read_card
 from toolkit.report.report_json import report_document

@@ -21,7 +21,7 @@ from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import cost, score_run
-from toolkit.report.comparison_text import report_text
+from toolkit.report.comparison_table import report_text
 from toolkit.report.figures import over_time
 from toolkit.report.records import read_metrics
 from toolkit.report.run_directory import MadeBy, write_run

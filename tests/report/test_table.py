@@ -15,17 +15,9 @@ from toolkit.metrics import Scores, known_metrics, metrics_called
 from toolkit.noise import MeasuredNoise, MotionScale, TrackWeight
 from toolkit.registry import discover
 from toolkit.report import text as texts
-from toolkit.report.comparison_table import (
-    change_lines,
-    comparison_table,
-    explained_metrics,
-    header_lines,
-    noise_line,
-    rules_line,
-    shown_metrics,
-)
-from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.comparison_table import change_lines, comparison_table, comparison_text, report_text
 from toolkit.report.evaluation import best_of
+from toolkit.report.headers import explained_metrics, header_lines, noise_line, rules_line, shown_metrics
 from toolkit.report.messages import note_lines
 from toolkit.report.records import read_manifest
 from toolkit.report.run_directory import MadeBy, write_run

@@ -1,7 +1,7 @@
 """The command ``vislam``: subcommands by what they are about; whatever is slow to import is imported to run.
 
 Reading order: arguments (how a command is declared, and the arguments that several share), then the commands about one
-thing in a file each: compare (with explain and sweep), evaluate, runs, recordings, gate, parts. Beside them
+thing in a file each: compare, trials (explain and sweep), evaluate, runs, recordings, gate, parts. Beside them
 progress_display. Here: how a command is run, and what becomes of errors, signals and its output.
 """
 
@@ -19,16 +19,16 @@ from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
-from toolkit.cli import compare, evaluate, gate, parts, recordings, runs
+from toolkit.cli import compare, evaluate, gate, parts, recordings, runs, trials
 from toolkit.cli.arguments import Parser, ShowVersion
 from toolkit.errors import OutputError, SystemLimitError, VislamError, one_line
+from toolkit.files.writing import ENDING
 
 # A defect and a lack of the system's means, as sysexits.h numbers them.
 _DEFECT, _SYSTEM = 70, 71
 _INTERRUPTED = 130
 # 128 + SIGPIPE, as the shell reports any program whose reader went away.
 _READER_GONE = 141
-_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 # Within this after the first, further signals let it clean up; one that comes later interrupts again, for the first may
 # have come where Python cannot raise it.
 _PATIENCE_S = 10.0
@@ -41,7 +41,7 @@ _LEAST_MEMORY = 300_000 * 1024
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
-    *(compare.compare, compare.explain, compare.sweep, evaluate.evaluate),
+    *(compare.compare, trials.explain, trials.sweep, evaluate.evaluate),
     *(runs.diff, runs.report, runs.export, runs.reproduce),
     *(gate.check, gate.baseline, recordings.check_data, recordings.card, parts.verify, parts.list_parts, parts.cite),
     *(recordings.simulate, recordings.tracks, recordings.import_tables, parts.completion),
@@ -218,7 +218,7 @@ def _ended_once(afterwards: signal.Handlers) -> Iterator[Collection[float]]:
             first.append(time.monotonic())
             raise KeyboardInterrupt
 
-    handlers = {number: before for number in _ENDING if (before := signal.getsignal(number)) != signal.SIG_IGN}
+    handlers = {number: before for number in ENDING if (before := signal.getsignal(number)) != signal.SIG_IGN}
     try:
         for number in handlers:
             signal.signal(number, interrupt)

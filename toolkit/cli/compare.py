@@ -1,4 +1,4 @@
-"""``vislam compare``, ``explain`` and ``sweep``: estimators on the same measurements, under one setting or many."""
+"""``vislam compare``: estimators on the same measurements; and what its kin in trials.py ask for and keep alike."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from toolkit.cli.arguments import (
     TOPICS,
     TRACKS,
     WORKERS,
-    UsageError,
     arg,
     at_least,
     choice,
@@ -32,16 +31,13 @@ from toolkit.cli.arguments import (
     names,
     output,
     requested_changes,
-    seconds_from_start,
 )
 from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
-    from msgspec import Struct
-
     from toolkit.experiment.comparison import Comparison
     from toolkit.experiment.configuration import Request
-    from toolkit.report.comparison_table import Columns
+    from toolkit.report.headers import Columns
     from toolkit.settings import Settings
 
 # The one with truth first: its table is the first impression.
@@ -49,7 +45,7 @@ SEQUENCES = ("drive", "kitti00")
 
 
 # How recordings are prepared and estimators run, of every command that does so.
-_HOW = (
+HOW = (
     *PART,
     REPAIR,
     choice("--start", ("measurements", "truth"), "source of the first state (default: measurements)", sets="start"),
@@ -60,9 +56,9 @@ _HOW = (
     choice("--vary", ("noise", "world"), "what a seed draws: noise, or the whole world (default: noise)", sets="vary"),
     *SETTINGS,
 )
-_SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
-_TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
-_OUT = arg(
+SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
+TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
+OUT = arg(
     "--out DIR",
     "run directory (default: runs/<date and time>); runs of several seeds or variants are kept there as they end, and "
     "the same command continues where it stopped",
@@ -81,7 +77,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     "run estimators on the same measurements and compare them",
     arg("sequences SEQUENCE", f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})", nargs="*"),
     estimators("estimators to compare, see 'vislam list estimators'; 'ladder' is every rung"),
-    _TRUTH,
+    TRUTH,
     arg(
         "--trajectory NAME=FILE",
         "another system's poses of the IMU, to be scored beside the estimators, as final or, with FILE:causal, as "
@@ -92,8 +88,8 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         default=[],
     ),
     COV_CONVENTION,
-    _OUT,
-    *_HOW,
+    OUT,
+    *HOW,
     flag("--keep-trajectories", "with --seeds, write the trajectories of every seed", default=None),
     arg(
         "--columns NAME,...",
@@ -105,7 +101,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     *FIGURES,
     FORMAT,
     output("what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"),
-    _SCHEDULER,
+    SCHEDULER,
     examples=("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",),
 )
 def compare(options: argparse.Namespace) -> int:
@@ -116,23 +112,23 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.experiment.configuration import plan_of
     from toolkit.experiment.pipeline import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.files.documents import to_line
-    from toolkit.report.comparison_table import requested_columns
+    from toolkit.report.headers import requested_columns
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
     from toolkit.report.scores import scores_document
 
     columns = requested_columns(options.columns)
-    request, settings = _requested(options)
+    request, settings = requested(options)
     plan = plan_of(request, settings, SEQUENCES, workers=options.workers, scheduler=options.scheduler)
     made_by = MadeBy(shlex.join(options.command_line), request, options.figure_format, options.figures)
     progress_for, all_ok = of_this_process(), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
-        directories = directories_for(cases, options.out if options.out is not None else _new_run())
+        directories = directories_for(cases, options.out if options.out is not None else new_run())
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
         for directory, store in stores.items():
             open_files.callback(store.close)
-            _tell_unusable(store.unusable, directory)
-        open_files.enter_context(_kept_where(stores))
+            tell_unusable(store.unusable, directory)
+        open_files.enter_context(kept_where(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
             try:
@@ -153,7 +149,7 @@ def compare(options: argparse.Namespace) -> int:
 
 def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) -> str:
     """Return a comparison in the form that was asked for; of CSV only the first has a heading."""
-    from toolkit.report import comparison_text as texts
+    from toolkit.report import comparison_table as texts
     from toolkit.report.text import width_of_output
 
     match form:
@@ -167,145 +163,13 @@ def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) 
     return texts.comparison_text(comparison, columns, width_of_output())
 
 
-@command(
-    "explain",
-    "say what makes one estimator more accurate than another, ingredient by ingredient",
-    arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
-    arg(
-        "--from NAME",
-        "the first estimator (default: the lowest with INGREDIENTS of those compared by default)",
-        dest="start_at",
-    ),
-    arg("--to NAME", "the second estimator (default: the highest of those)", dest="goal"),
-    arg(
-        "--estimators NAME,...",
-        "those that may be run between the two, with and without ingredients, or files (default: all)",
-        names,
-    ),
-    _TRUTH,
-    _OUT,
-    arg("--since TIME", "leave out frames before it, as in 10s", seconds_from_start, dest="from_s"),
-    arg("--until TIME", "leave out frames after it, as in 10s", seconds_from_start, dest="to_s"),
-    *(one for one in _HOW if one not in PART[:2]),
-    WORKERS,
-    _SCHEDULER,
-    output("what explain.json holds, no table", "the run directory has everything"),
-    examples=(
-        "vislam explain drive --from ekf --to ekf-slam --until 3s --estimators ekf,ekf-slam --out runs/why",
-        "vislam report runs/why",
-    ),
-)
-def explain(options: argparse.Namespace) -> int:
-    """Run what lies between two estimators on one recording, and say what each ingredient in which they differ brings:
-    added as near to the first as can be, and taken away as near to the second; with 95 % intervals over 3 seeds or
-    more, or over stretches of a recording. docs/explain.md tells how.
-    """
-    from toolkit.cli.progress_display import of_this_process
-    from toolkit.experiment.configuration import plan_of
-    from toolkit.experiment.explanation import default_ends, run_explanation
-    from toolkit.registry import discover
-    from toolkit.report.explanation import EXPLANATIONS, write_explanation
-    from toolkit.report.text import width_of_output
-
-    options.sequences = [options.sequence]
-    options.estimators = options.estimators or tuple(discover())
-    plan = plan_of(*_requested(options), (), workers=options.workers, scheduler=options.scheduler)
-    usual = default_ends()
-    ends = options.start_at or usual[0], options.goal or usual[1]
-    target, progress_for = options.out or _new_run(), of_this_process()
-    EXPLANATIONS.check(target)
-    with _kept_where([target]):
-        found = run_explanation(plan, *ends, target, progress_for)
-    with progress_for(f"{found.grid.case.name}: figure"):
-        document = write_explanation(found, target, shlex.join(options.command_line))
-    _tell_unusable(found.grid.unusable, target)
-    _print(document, EXPLANATIONS.text(document, width_of_output()), target, options)
-    return 0
-
-
-def over(text: str) -> tuple[str, tuple[str, ...]]:
-    name, equals, values = text.partition("=")
-    given = tuple(value.strip() for value in values.split(",") if value.strip())
-    if not (equals and name.strip() and given):
-        raise argparse.ArgumentTypeError(f"expected KEY=V1,V2,... or fault:NAME=D1,D2,..., not {text!r}")
-    return name.strip(), given
-
-
-@command(
-    "sweep",
-    "vary settings or plant faults in doses, and see where estimators break",
-    arg("sequence SEQUENCE", "a recording's path, or a built-in name", nargs="?"),
-    arg(
-        "--over KEY=V1,V2,...",
-        "vary a setting (see 'vislam list settings'), or plant fault:NAME in doses (see 'vislam list injectors'); two "
-        "are crossed, every value with every other",
-        over,
-        action="append",
-        default=[],
-    ),
-    flag("--each", "vary each of several by itself, and cross none", default=None),
-    estimators("estimators to run, see 'vislam list estimators'"),
-    _TRUTH,
-    _OUT,
-    *_HOW,
-    WORKERS,
-    _SCHEDULER,
-    output("what sweep.json holds, no table", "the run directory has everything"),
-    examples=(
-        "vislam sweep drive --over fault:dropped_frames=0.3,0.8 --estimators dead-reckoning,ekf --seeds 2 --to 3s "
-        "--out runs/sweep",
-    ),
-)
-def sweep(options: argparse.Namespace) -> int:
-    """Run estimators on one recording at every value of a setting, or with a fault planted in every dose of it, over
-    seeds, and tell how their errors compare with those without: a table with 95 % intervals, the dose at which each
-    breaks, what the audit would have said, and figures.
-    """
-    from toolkit.cli.progress_display import of_this_process
-    from toolkit.experiment.configuration import SweepRequest, plan_of, read_sweep_request
-    from toolkit.experiment.sweep import run_sweep
-    from toolkit.report.figures.sweeps import draw_sweep
-    from toolkit.report.sweep import SWEEPS, write_sweep
-    from toolkit.settings.reading import assigned
-
-    requested = SweepRequest() if options.config is None else read_sweep_request(options.config)
-    axes = {name: [assigned(f"{name}={value}")[1] for value in values] for name, values in options.over}
-    if len(axes) < len(options.over):
-        raise UsageError("--over names the same twice; give all its values at once")
-    options.sequences = None if options.sequence is None else [options.sequence]
-    plan = plan_of(*_requested(options), (), workers=options.workers, scheduler=options.scheduler)
-    if not plan.sources:
-        raise UsageError("name the sequence to sweep, a path or a built-in name as drive")
-    target, progress_for = options.out or _new_run(), of_this_process()
-    SWEEPS.check(target)
-    with _kept_where([target]):
-        crossed = not (options.each or requested.each)
-        found = run_sweep(plan, axes or requested.over, crossed=crossed, directory=target, progress_for=progress_for)
-    with progress_for(f"{found.grid.case.name}: figures"):
-        document = write_sweep(found, target, shlex.join(options.command_line), list(draw_sweep(found)))
-    _tell_unusable(found.grid.unusable, target)
-    _print(document, SWEEPS.text(document), target, options)
-    return 0
-
-
-def _tell_unusable(count: int, directory: Path) -> None:
+def tell_unusable(count: int, directory: Path) -> None:
     if count:
         what = f"{count} outcomes of other data, noise or repairs, or of another version"
         print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
 
 
-def _print(document: Struct, text: str, target: Path, options: argparse.Namespace) -> None:
-    from toolkit.cli.progress_display import print_above
-    from toolkit.files.documents import to_line
-
-    where = printable(str(target))
-    if options.json:
-        print_above(to_line(document).rstrip())
-    elif not options.quiet:
-        print_above(f"{text}\n\nresults: {where}; as a page: vislam report {shlex.quote(where)}")
-
-
-def _requested(options: argparse.Namespace) -> tuple[Request, Settings]:
+def requested(options: argparse.Namespace) -> tuple[Request, Settings]:
     """Return what is to be compared and how: the file of --config, and over it the command line."""
     from toolkit.experiment.configuration import COMPARE, Request, read_configuration, record_of
     from toolkit.metrics import requests_of
@@ -325,7 +189,7 @@ def _requested(options: argparse.Namespace) -> tuple[Request, Settings]:
 
 
 @contextmanager
-def _kept_where(directories: Iterable[Path]) -> Iterator[None]:
+def kept_where(directories: Iterable[Path]) -> Iterator[None]:
     """Say after an interrupt where outcomes are that were kept; raises Interrupted then, if there are any."""
     from toolkit.experiment.outcome_store import OUTCOMES
 
@@ -339,7 +203,7 @@ def _kept_where(directories: Iterable[Path]) -> Iterator[None]:
         raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
 
 
-def _new_run() -> Path:
+def new_run() -> Path:
     from datetime import datetime
 
     stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")

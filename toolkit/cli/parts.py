@@ -124,7 +124,7 @@ def verify(options: argparse.Namespace) -> int:
     """
     from toolkit.cli.progress_display import of_this_process
     from toolkit.files.documents import to_text
-    from toolkit.report.comparison_text import verification_text
+    from toolkit.report.gate import verification_text
     from toolkit.report.text import width_of_output
     from toolkit.verify import subject_of, verify
 

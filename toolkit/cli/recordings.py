@@ -52,7 +52,7 @@ def check_data(options: argparse.Namespace) -> int:
     """
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.recording import audited_recording
-    from toolkit.report.comparison_text import audit_text
+    from toolkit.report.card import audit_text
     from toolkit.report.text import width_of_output
 
     recording = replace(requested_recording(options), truth=options.truth)

@@ -18,7 +18,7 @@ from toolkit.errors import OutputError
 # Returns the entries of a directory that the toolkit wrote and may replace: relative paths, folders with a slash.
 Owner = Callable[[Path], Collection[str]]
 # Signals that ask a program to end; while a result is moved to its place they are held back.
-_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # First characters of a table of numbers: a comment, a sign, a digit.
 _OF_TABLES = tuple(c.encode() for c in "#+-.0123456789")
@@ -101,7 +101,7 @@ def uninterrupted() -> Iterator[None]:
     """Hold back signals that end the program until the block is left, so that no rename is interrupted."""
     requested: list[int] = []
     try:
-        before = {number: signal.getsignal(number) for number in _ENDING}
+        before = {number: signal.getsignal(number) for number in ENDING}
         for number in before:
             signal.signal(number, lambda got, _frame: requested.append(got))
     except ValueError:  # only the main thread may set signal handlers

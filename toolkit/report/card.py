@@ -1,4 +1,4 @@
-"""The card of a recording as text and as a record: why a smoother is or is not better than a filter on it."""
+"""A recording as text: what its audit found, and its card, which is a record too and says whether a smoother gains."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -6,11 +6,14 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from toolkit.audit import Audit
+from toolkit.errors import printable
 from toolkit.files.documents import number, reader, rounded
 from toolkit.geometry import Array
 from toolkit.noise import Card
-from toolkit.report.comparison_table import sequence_line, tracks_measured
-from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, filled
+from toolkit.report.headers import sequence_line, tracks_measured
+from toolkit.report.messages import outcome, undecided_lines
+from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, filled, section
 from toolkit.sequence import Sequence
 
 Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
@@ -94,6 +97,23 @@ def card_lines(card: Card) -> Iterator[str]:
         )
     else:
         yield f"vision and the measured motion agree in scale, to {abs(off):.2%} +- {error:.2%}"
+
+
+def audit_text(audited: Audit, width: Width = WIDTH) -> str:
+    findings = audited.findings
+    lines = [printable(sequence_line(audited.sequence)), ""]
+    if findings:
+        headings = (("fault",), ("outcome",), ("count",))
+        rows = tuple((f.fault, outcome(f), str(f.count)) for f in findings)
+        lines += [as_text(Table(headings, rows, labels=2)), ""]
+        lines += [filled(f"{finding.fault}: {finding.detail}", width) for finding in findings]
+    else:
+        lines += ["no fault found"]
+    lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
+    lines += section("facts", audited.sequence.provenance.facts, width)
+    if findings and not audited.undecided and not any(f.blocking or f.warning for f in findings):
+        lines += ["", "no fault is left that invalidates a result"]
+    return "\n".join(lines)
 
 
 def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:

@@ -1,42 +1,61 @@
-"""The table of a comparison: its columns, and the lines above it with the recording and the common rules.
+"""The table of a comparison, and the comparison as text: as it is printed, and as ``report.md``.
 
-Which metrics have a column by default is in the metrics' records (:mod:`toolkit.metrics`).
+Below the table stand the verdict and the most harmful notes; the report has everything needed to read the table.
 """
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from typing import Literal
+from collections.abc import Iterable, Iterator, Mapping
 
-import numpy as np
-
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.metrics import Metric, known_metrics, metrics_called
-from toolkit.noise import TrackWeight
-from toolkit.report.scores import path_length_m
-from toolkit.report.text import MISSING, Table, cell, heading, number, unit_of
-from toolkit.sequence import Sequence
-from toolkit.settings import Window, outlier_summary
+from toolkit.metrics import known_metrics
+from toolkit.report.card import card_lines
+from toolkit.report.headers import Columns, explained_metrics, header_lines, shown_metrics
+from toolkit.report.messages import consistency_lines, finding_lines, log_lines, note_lines, remark_lines, verdict
+from toolkit.report.text import (
+    MISSING,
+    WIDTH,
+    Table,
+    Width,
+    as_csv,
+    as_latex,
+    as_markdown,
+    as_text,
+    cell,
+    filled,
+    heading,
+    in_markdown,
+    markdown_section,
+    number,
+    section,
+    unit_of,
+)
 
 # The metric whose mean over seeds is compared with its band, in a column after that of the mean.
 _BANDED = "nees_pose_mean"
-# First columns of a real drive: the drift, and the error after a fit that keeps the vertical. After an SE(3) fit of a
-# drive, differences of good estimators are chance (one model solved twice differed by a metre). The drift replaces the
-# RPE.
-_LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
-# The columns of a table: None for the usual ones, "all", or metrics by key or name.
-Columns = None | Literal["all"] | tuple[str, ...]
-_MOTION = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}
+# Notes below the printed table; the report has all.
+_MOST_NOTES = 3
 
+_HOW_TO_READ_ONE = """\
+Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
+estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like. A line
+named for a file, as in `openvins (est.txt)`, was not run here but read from it and scored by the same rules. An error
+over half a recording is not half an error: read it beside the matched pairs and the coverage. `metrics.json` has every
+metric, and for each one that is missing the reason."""
+_HOW_TO_READ_MANY = """\
+Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
+means over the runs that are ok; `seeds.json` has each seed's value of every metric, and quartiles over all runs. The
+NEES band is the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided 95 %
+chi-square band for that many runs: 95 % on average for a consistent estimator, with much scatter between sets of
+seeds."""
+_HOW_TO_READ = """\
+Beside how a run ended, `overconfident` and `timid` say that its errors, or without a truth its innovations, are larger
+or smaller than the uncertainty it states allows; `heavy-tailed` and `contradicted` are in the notes.
 
-def requested_columns(names: tuple[str, ...]) -> Columns:
-    """Return the columns that some names ask for: the usual ones where there are none, all for the one word "all".
+The verdict names a winner only where a paired test supports it: over seeds by the seeds, of one run by the drift over
+up to 40 stretches of the path, or by withheld tracks in ten stretches of time. Each interval has 99 %.
 
-    Raises UnknownNameError for a name that is no metric's.
-    """
-    if names == ("all",):
-        return "all"
-    metrics_called(names)
-    return names or None
+What no estimator is given: withheld tracks, and in a causal answer the future; only the start of raw IMU recordings
+uses the first 1.5 s, and the audit the whole recording, the same for all."""
 
 
 def comparison_table(comparison: Comparison, columns: Columns = None) -> Table:
@@ -75,53 +94,6 @@ def _columns(comparison: Comparison, columns: Columns) -> Iterator[tuple[tuple[s
             yield ("NEES", "band", "%"), [MISSING if nees is None else number(nees.in_band_percent) for nees in means]
 
 
-def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
-    """Return the metrics that have a column; without any value a metric has one only if it is named.
-
-    Pairs and coverage, whose records say so, are a column where rows differ; else :func:`shared_values` has them.
-    """
-    if columns is not None and columns != "all":
-        return metrics_called(columns)
-    valued = [metric for metric in known_metrics() if any(v is not None for v in _values(comparison, metric))]
-    if columns == "all":
-        return tuple(valued)
-    if comparison.over_seeds:
-        return tuple(metric for metric in valued if metric.over_seeds)
-    differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
-    return (*differing, *usual_metrics(valued, real=comparison.sequence.provenance.format != "simulated"))
-
-
-def usual_metrics(valued: list[Metric], *, real: bool) -> list[Metric]:
-    """Return the columns of one run by default, of the metrics that have values.
-
-    Those of a ``real`` recording are those of a drive where it is long enough for the KITTI benchmark's drift.
-    """
-    usual = [metric for metric in valued if metric.table == "always"]
-    leading = [metric for key in _LEADING for metric in valued if metric.key == key]
-    if not real or len(leading) < len(_LEADING):
-        return usual
-    return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SHOWN_AS_DRIFT))]
-
-
-def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
-    if columns is None and comparison.over_seeds:
-        return tuple(metric for metric in known_metrics() if metric.over_seeds)
-    if columns is None:
-        shown = shown_metrics(comparison)
-        return tuple(metric for metric in known_metrics() if metric in shown or metric.table != "on request")
-    return known_metrics() if columns == "all" else metrics_called(columns)
-
-
-def shared_values(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield, in words, pairs and coverage where they have no column: one value, or from the least to the most."""
-    shown = shown_metrics(comparison, columns)
-    for metric in known_metrics():
-        values = sorted({value for value in _values(comparison, metric) if value is not None})
-        if metric.table == "where rows differ" and metric not in shown and values:
-            ends = " to ".join(dict.fromkeys(cell(value, metric) for value in (values[0], values[-1])))
-            yield " ".join(filter(None, (metric.name, ends, metric.unit)))
-
-
 def change_lines(changes: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Yield an aligned line for each estimator with its change against the rung before; none outside a ladder."""
     given = [(name, change) for name, change in changes if change]
@@ -130,88 +102,68 @@ def change_lines(changes: Iterable[tuple[str, str]]) -> Iterator[str]:
         yield f"{name:<{width}}  {change}"
 
 
-def _values(comparison: Comparison, metric: Metric) -> list[float | None]:
-    return [row.value(metric.key) for row in comparison.lines]
+def comparison_text(comparison: Comparison, columns: Columns = None, width: Width = WIDTH) -> str:
+    """Return the comparison as plain text, its prose no wider than ``width``; the table is never wrapped or cut.
+
+    Raises VislamError for an unknown column.
+    """
+    lines = [filled(entry, width) for entry in header_lines(comparison, columns)]
+    lines += ["", as_text(comparison_table(comparison, columns)), "", filled(verdict(comparison), width, further="")]
+    notes = list(note_lines(comparison, columns))
+    shown = notes[:_MOST_NOTES]
+    if notes[_MOST_NOTES:]:
+        shown[-1] += f" ({len(notes) - _MOST_NOTES} more in report.md)"
+    lines += section("notes", shown, width)
+    if comparison.card is not None:
+        lines += section("card", card_lines(comparison.card), width)
+    return "\n".join(lines)
 
 
-def sequence_line(sequence: Sequence) -> str:
-    path_m = path_length_m(sequence)
-    count = len(sequence.observations)
-    sightings = f"{count} stereo observations" if count else "no image features"
-    path = "no ground truth" if path_m is None else f"true path {path_m:.0f} m"
-    motion = _MOTION[sequence.motion_kind]
-    return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
+def comparison_markdown(comparison: Comparison, columns: Columns = None) -> str:
+    """Return the recording, the rules, the table and the verdict as Markdown; raises VislamError as the table does."""
+    table = as_markdown(comparison_table(comparison, columns))
+    lines = [in_markdown(line) + "." for line in header_lines(comparison, columns)]
+    return "\n\n".join([*lines, table, in_markdown(verdict(comparison))])
 
 
-def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what stands above a table: the recording, pairs and coverage the rows share, the common rules."""
-    seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
-    yield sequence_line(comparison.sequence) + seeds
-    shared = ", ".join(shared_values(comparison, columns))
-    if shared:
-        yield f"scored: {shared}"
-    yield rules_line(comparison)
-    if len(comparison.sequence.observations):
-        yield noise_line(comparison)
+def comparison_latex(comparison: Comparison, columns: Columns = None) -> str:
+    """Return the table for a paper, after comments with recording and rules; the package booktabs is needed."""
+    comments = [f"% {printable(line)}" for line in header_lines(comparison, columns)]
+    return "\n".join([*comments, as_latex(comparison_table(comparison, columns))])
 
 
-def rules_line(comparison: Comparison) -> str:
-    """Return the rules that estimators had in common: the window, whether its cap binds, outliers, budget of tracks."""
-    settings, sequence = comparison.settings, comparison.sequence
-    window = settings.window
-    left_out = _left_out(sequence, window)
-    thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
-    budget, of_all = sequence.track_budget, len(replace(sequence, track_budget=None).visible) / sequence.frame_count
-    return (
-        f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
-        f"outliers: {outlier_summary(settings.outliers)}"
-        f"{'' if budget is None else f'; at most {budget} of {of_all:.0f} tracks a frame'}"
-        f"{'' if settings.noise.bridge_gaps else '; gaps between tracks not bridged'}"
-        f"{'; started from the truth' if settings.start == 'truth' else ''}"
+def comparison_csv(comparison: Comparison) -> str:
+    """Return a line a row of the table with every metric in full: over seeds means over the runs that are ok."""
+    keys = [metric.key for metric in known_metrics()]
+    rows = (
+        [comparison.name, row.estimator, row.label, len(row.outcomes), row.counts["ok"], *map(row.value, keys)]
+        for row in comparison.lines
     )
+    return as_csv(["sequence", "estimator", "output", "runs", "ok", *keys], rows).rstrip("\n")
 
 
-_MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
-
-
-def noise_line(comparison: Comparison) -> str:
-    rig, settings, measured = comparison.sequence.rig, comparison.settings.noise, comparison.measured
-    tracks = motion = ""
-    if measured is not None:
-        tracks, scale = tracks_measured(measured.tracks), measured.motion
-        times = f"{scale.value:.2g} +- {scale.error:.1g} times as noisy as stated"
-        motion = "as stated" if scale.value == 1.0 else times
-    if settings.track_weight != "auto":
-        tracks = f"each counted at {rig.track_weight:.2g} of its information, as set"
-    if settings.motion_scale != "auto":
-        motion = f"{settings.motion_scale:.3g} times as noisy as stated, as set"
-    line = (
-        f"noise: sightings {float(np.sqrt(rig.cov_uv_px2[0, 0])):.2g} px, {tracks}; "
-        f"{_MOTION_NOISE[comparison.sequence.motion_kind]} {motion}"
-    )
-    if measured is None:
-        return line
-    if measured.why_not:
-        return f"{line} (not measured: {measured.why_not})"
-    basis = "recording" if settings.measured_s is None else f"first {settings.measured_s:g} s"
-    return f"{line}; measured on the {basis}"
-
-
-def tracks_measured(weight: TrackWeight) -> str:
-    """Return in words how correlated the errors of a track are, and what a sighting counts for then."""
-    if not weight.correlation:
-        return "white along tracks"
-    along = f"errors along tracks correlated, {weight.correlation:.2f} from frame to frame"
-    if weight.value == 1.0:
-        return f"each counted in full ({along}, but smaller than stated)"
-    return f"each counted at {weight.value:.2g} +- {weight.error:.1g} of its information ({along})"
-
-
-def _left_out(sequence: Sequence, window: Window) -> int:
-    """Return how many frames have no state in the window, because it would hold too many."""
-    last, left_out = -1, 0
-    for since_ns in (sequence.frames_t_ns - sequence.frames_t_ns[:1]).tolist():
-        interval = window.interval(since_ns, sequence.motion_kind)
-        left_out += interval == last
-        last = interval
-    return left_out
+def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
+    """Return the report; ``captions`` maps the file names of the figures, beside the report, to their captions."""
+    seeds = f", {len(comparison.seeds)} seeds" if comparison.over_seeds else ""
+    parts = [
+        f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
+        *(f"{in_markdown(line)}." for line in header_lines(comparison)),
+        as_markdown(comparison_table(comparison)),
+        f"**{in_markdown(verdict(comparison))}**",
+        *markdown_section("Is the stated uncertainty consistent?", consistency_lines(comparison)),
+        *markdown_section("Notes", note_lines(comparison)),
+        *markdown_section("Remarks on single numbers", remark_lines(comparison)),
+        *markdown_section("What the estimators report", log_lines(comparison)),
+        *markdown_section("Where every estimator started", [comparison.prior.source]),
+        *markdown_section("What the audit found in the recording", finding_lines(comparison)),
+        *markdown_section("About this recording", comparison.sequence.provenance.facts),
+        *markdown_section("Its tracks", () if comparison.card is None else card_lines(comparison.card)),
+        "## Figures",
+        *(f"![{in_markdown(said)}](figures/{name})\n\n*{in_markdown(said)}*" for name, said in captions.items()),
+        "## How to read the table",
+        _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE,
+        _HOW_TO_READ,
+        "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison)),
+        "`vislam report` with the path of this folder makes an interactive page of it.",
+    ]
+    return "\n\n".join(parts) + "\n"

@@ -1,10 +1,8 @@
 """An explanation in words, as a table, as ``explain.json`` (``vislam.explain/1``), and the folder that has it all."""
 
 import math
-from collections.abc import Iterator, Sequence
-from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -21,9 +19,12 @@ from toolkit.experiment.explanation import (
 from toolkit.files.documents import reader
 from toolkit.metrics import metrics_called
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import Results, Shown
+from toolkit.report.run_directory import Results, Shown
 from toolkit.report.text import MISSING, Table, listed, number
 from toolkit.settings import changes_of
+
+if TYPE_CHECKING:
+    from toolkit.report.figures.style import NamedFigure
 
 Kind = Literal["added", "taken"]
 _DIGITS = 3
@@ -54,7 +55,7 @@ read_explanation = reader(ExplanationRecord, "repeat vislam explain")
 
 
 def explanation_document(
-    found: Explanation, command: str = "", figures: dict[str, str] | None = None, files: tuple[str, ...] = ()
+    found: Explanation, command: str = "", figures: Mapping[str, str] | None = None, files: tuple[str, ...] = ()
 ) -> ExplanationRecord:
     """Return an explanation as a record; ``figures`` are captions by file, ``files`` all that is written beside it."""
     plan = found.grid.plan
@@ -69,7 +70,7 @@ def explanation_document(
         words="",
         gap=found.gap,
         parts=found.parts,
-        figures=figures or {},
+        figures=dict(figures or {}),
         files=files,
     )
     return msgspec.structs.replace(record, words=in_words(record))
@@ -272,12 +273,10 @@ def _shown_as(found: ExplanationRecord) -> Shown:
     return Shown(title, found.words, explanation_table(found), found.figures, found.files)
 
 
-EXPLANATIONS = Results("explain.json", "explain.md", read_explanation, _shown_as)
+def _drawn(found: Explanation) -> "Iterator[NamedFigure]":
+    from toolkit.report.figures.waterfall import draw_explanation  # here alone, for matplotlib takes long to import
+
+    return draw_explanation(explanation_document(found))
 
 
-def write_explanation(found: Explanation, target: Path, command: str) -> ExplanationRecord:
-    """Write the explanation's folder: document, Markdown and figure; raises as :meth:`Results.write` does."""
-    from toolkit.report.figures.waterfall import draw_explanation
-
-    figures = draw_explanation(explanation_document(found))
-    return EXPLANATIONS.write(target, figures, partial(explanation_document, found, command))
+EXPLANATIONS = Results("explain.json", "explain.md", explanation_document, read_explanation, _shown_as, _drawn)

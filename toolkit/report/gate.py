@@ -1,6 +1,6 @@
 """A check of the gate as text: a table of what fails or of everything, notes, failures with reasons, the verdict.
 
-And its files, each on request: JUnit XML, Markdown and JSON.
+And its files, each on request: JUnit XML, Markdown and JSON. Last, what verification finds of an estimator's promises.
 """
 
 import math
@@ -17,7 +17,8 @@ from toolkit.files.writing import write_text
 from toolkit.gate.checking import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, number, section
+from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, filled, number, section
+from toolkit.verify import VerificationRecord
 
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
@@ -252,3 +253,16 @@ BEGINNINGS: Mapping[str, str] = {"junit": "<", "markdown": "#", "json": "{"}
 def write_check(check: Check, files: Mapping[str, Path]) -> None:
     for kind, path in files.items():
         write_text(path, WRITERS[kind](check))
+
+
+def verification_text(verification: VerificationRecord, width: Width = WIDTH) -> str:
+    rows = tuple((check.name, check.result) for check in verification.checks)
+    lines = [as_text(Table((("promise",), ("result",)), rows, labels=2)), ""]
+    for check in verification.checks:
+        if check.result == "failed":
+            lines += [filled(f"{check.name}: {check.found}", width), filled(check.remedy, width, "  to do: "), ""]
+        elif check.found:
+            lines += [filled(f"{check.name}: {check.found}", width), ""]
+    failed = sum(check.result == "failed" for check in verification.checks)
+    told = "keeps every promise" if not failed else f"breaks {failed} of {len(verification.checks)} promises"
+    return "\n".join([*lines, f"{verification.estimator} {told}"])

@@ -24,7 +24,7 @@ from toolkit.metrics import is_on_request, metrics_called, unavailable
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.reprojection import RATIO
 from toolkit.registry import discover
-from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
+from toolkit.report.headers import Columns, explained_metrics, shown_metrics
 from toolkit.report.text import cell, listed, number
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.

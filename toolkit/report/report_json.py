@@ -15,7 +15,6 @@ from toolkit.files.documents import number, numbers, of_attributes, reader, roun
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.report.card import CardRecord, card_record
-from toolkit.report.comparison_table import header_lines, noise_line, sequence_line
 from toolkit.report.curves import (
     NOT_ALIGNED,
     Columns,
@@ -38,6 +37,7 @@ from toolkit.report.curves import (
     shown_output,
     truth_during,
 )
+from toolkit.report.headers import header_lines, noise_line, sequence_line
 from toolkit.report.messages import (
     ContestRecord,
     consistency_lines,

@@ -1,19 +1,21 @@
-"""The run directory: everything one comparison leaves behind, written at once or not at all, and read back.
+"""The directories that commands leave behind, written at once or not at all: first that of a comparison.
 
-It is read with nothing but its own files, so that this works on any machine.
+It is read with nothing but its own files, so that this works on any machine. Then that of a sweep or an explanation.
 """
 
 import io
 import os
+import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from toolkit.answers import Output
 from toolkit.datasets.trajectories import openvins, tum
@@ -25,11 +27,12 @@ from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.recording import Prepared
 from toolkit.files.documents import to_line, to_text
 from toolkit.files.reading import read_input
-from toolkit.files.writing import check_parent, check_replaceable, plain_name, replaced_directory
+from toolkit.files.writing import check_parent, check_replaceable, plain_name, replaced_directory, with_folders
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
-from toolkit.report.comparison_text import report_text
+from toolkit.report.comparison_table import report_text
 from toolkit.report.curves import truth_during
+from toolkit.report.html import card
 from toolkit.report.manifest import Manifest, manifest_document, read_manifest
 from toolkit.report.report_json import (
     TRUTH_FILE,
@@ -43,7 +46,6 @@ from toolkit.report.report_json import (
     report_document,
     seeds_report_document,
 )
-from toolkit.report.results_folder import PAGE, own_files, take_over
 from toolkit.report.scores import (
     MetricsDocument,
     RunOverSeeds,
@@ -54,19 +56,22 @@ from toolkit.report.scores import (
     read_seeds,
     seeds_document,
 )
+from toolkit.report.text import Table, Width, as_markdown, as_text, filled, in_markdown
 
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
 _ERRORS = ("ate_none_m", "ate_se3_m", "ate_yaw_m", "heldout_reproj_rmse_px", "nees_pose_mean")
 
 if TYPE_CHECKING:
     from toolkit.report.figures import FigureChoice, FigureFormat
-
+    from toolkit.report.figures.style import NamedFigure
 
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 # What a sweep or an explanation leaves in their place.
 _RESULTS = ("sweep.json", "explain.json")
-REPORT_TEXT = "report.md"
+REPORT_TEXT, PAGE = "report.md", "report.html"
 FOLDERS = ("figures", "landmarks", "states", "trajectories")
+Found = TypeVar("Found")
+Record = TypeVar("Record", bound=Struct)
 
 
 def check_run_directory(target: Path) -> None:
@@ -81,6 +86,26 @@ def written_by_us(directory: Path) -> frozenset[str]:
     ``vislam report`` puts beside them.
     """
     return own_files(directory, _written)
+
+
+def own_files(directory: Path, written: Callable[[Path], Iterable[str]]) -> frozenset[str]:
+    """Return what of ours is in a folder by its relative path, folders with a slash behind.
+
+    It is outcomes, and what was ``written`` as the folder's document says, which may raise DataError where there is no
+    such document of ours: many programs write a file of that name.
+    """
+    files = set(files_of_ours(directory))
+    with suppress(DataError):
+        files |= set(written(directory))
+    return with_folders(files)
+
+
+def take_over(file: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.hardlink_to(file)
+    except OSError:  # a file system without links
+        shutil.copyfile(file, place)
 
 
 def _written(directory: Path) -> Iterator[str]:
@@ -160,9 +185,13 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             captions = save(drawn(comparison, made_by.choice), directory / "figures", made_by.figures)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.request)
-        written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
-        manifest = msgspec.structs.replace(manifest, files=tuple(sorted([*written, MANIFEST])))
+        manifest = msgspec.structs.replace(manifest, files=tuple(sorted([*files_in(directory), MANIFEST])))
         _write_text(directory / MANIFEST, to_text(manifest))
+
+
+def files_in(directory: Path) -> list[str]:
+    """Return the relative paths of all files in a directory, sorted."""
+    return sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file())
 
 
 def _texts(comparison: Comparison) -> Iterator[tuple[str, str]]:
@@ -309,3 +338,72 @@ def _numbers(path: Path, columns: int, delimiter: str | None, header_lines: int 
     if table.shape[1] != columns:
         raise DataError(f"{path} has {table.shape[1]} columns, not {columns}; repeat the comparison")
     return table
+
+
+class Shown(NamedTuple):
+    """What a document says: title, words, table, captions by figure, and files."""
+
+    title: str
+    words: str
+    table: Table
+    figures: Mapping[str, str]
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Results(Generic[Found, Record]):
+    """The folder of a sweep or an explanation: the names of its document and its Markdown, and how they come about.
+
+    The document is ``made`` of what was found, the command, captions by figure and the names of all files; it is
+    ``read`` back and ``shown``. Figures are ``drawn`` of what was found.
+    """
+
+    document: str
+    markdown: str
+    made: Callable[[Found, str, Mapping[str, str], tuple[str, ...]], Record]
+    read: Callable[[Path], Record]
+    shown: Callable[[Record], Shown]
+    drawn: Callable[[Found], "Iterator[NamedFigure]"]
+
+    def check(self, target: Path) -> None:
+        """Raise OutputError unless the results can be written at ``target`` without the loss of anybody's files."""
+        check_replaceable(target, self._ours)
+
+    def _ours(self, directory: Path) -> frozenset[str]:
+        return own_files(directory, lambda at: (self.document, PAGE, *self.shown(self.read(at / self.document)).files))
+
+    def text(self, record: Record, width: Width = None) -> str:
+        shown = self.shown(record)
+        return f"{filled(shown.words, width, further='')}\n\n{as_text(shown.table)}"
+
+    def as_markdown(self, record: Record) -> str:
+        shown = self.shown(record)
+        figures = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in shown.figures.items())
+        parts = (f"# {in_markdown(shown.title)}", in_markdown(shown.words), as_markdown(shown.table), *figures)
+        return "\n\n".join(parts) + "\n"
+
+    def section(self, directory: Path) -> str:
+        """Return the section of the page for a folder; raises DataError where its document or a figure is missing."""
+        shown = self.shown(self.read(directory / self.document))
+        figures = {directory / name: caption for name, caption in shown.figures.items()}
+        return card(shown.title, [shown.words], shown.table, figures)
+
+    def write(self, found: Found, target: Path, command: str) -> Record:
+        """Write the folder anew: figures, PNG and PDF, then the document and its Markdown; return the document.
+
+        Outcomes kept in the folder stay. Raises OutputError where it cannot be written or holds something else;
+        nothing is left behind then.
+        """
+        from toolkit.report.figures import save
+
+        drawn, names = list(self.drawn(found)), (self.markdown, self.document)
+        with replaced_directory(target, self._ours) as directory:
+            if (target / OUTCOMES).exists():
+                take_over(target / OUTCOMES, directory / OUTCOMES)
+            (directory / "figures").mkdir()
+            save(drawn, directory / "figures", "pdf")
+            captions = {f"figures/{name}": text for name, text in save(drawn, directory / "figures").items()}
+            record = self.made(found, command, captions, (*files_in(directory), *names))
+            for name, text in zip(names, (self.as_markdown(record), to_text(record)), strict=True):
+                _write_text(directory / name, text)
+        return record

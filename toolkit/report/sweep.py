@@ -1,10 +1,8 @@
 """A sweep as ``sweep.json`` (the contract ``vislam.sweep/1``), as a table and text made of that, and as a folder."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta, Struct
@@ -14,9 +12,9 @@ from toolkit.experiment.sweep import BREAKS_AT, Breaking, Sweep
 from toolkit.files.documents import number as finite
 from toolkit.files.documents import of_attributes, reader
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.comparison_table import sequence_line
+from toolkit.report.headers import sequence_line
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import Results, Shown
+from toolkit.report.run_directory import Results, Shown
 from toolkit.report.text import MISSING, Table, cell, number, unit_of
 from toolkit.settings import Scalar, changes_of
 
@@ -80,7 +78,7 @@ read_sweep = reader(SweepRecord, "repeat the sweep")
 
 
 def sweep_document(
-    sweep: Sweep, command: str = "", figures: Mapping[str, str] | None = None, files: Iterable[str] = ()
+    sweep: Sweep, command: str = "", figures: Mapping[str, str] | None = None, files: tuple[str, ...] = ()
 ) -> SweepRecord:
     """Return a sweep as a record; ``figures`` are captions by file, ``files`` what was written beside it."""
     plan, sequence = sweep.grid.plan, sweep.grid.case.sequence
@@ -107,7 +105,7 @@ def sweep_document(
         effects=tuple(of_attributes(EffectRecord, e, _in_json, at=dict(e.point)) for e in sweep.effects.values()),
         breaking=sweep.breaking,
         figures=dict(figures or {}),
-        files=tuple(files),
+        files=files,
     )
 
 
@@ -190,9 +188,10 @@ def _shown_as(sweep: SweepRecord) -> Shown:
     return Shown(f"Sweep of {sweep.sequence.name}", sweep.about, sweep_table(sweep), sweep.figures, sweep.files)
 
 
-SWEEPS = Results("sweep.json", "sweep.md", read_sweep, _shown_as)
+def _drawn(sweep: Sweep) -> "Iterator[NamedFigure]":
+    from toolkit.report.figures.sweeps import draw_sweep  # here alone, for matplotlib takes long to import
+
+    return draw_sweep(sweep)
 
 
-def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Iterable[NamedFigure]") -> SweepRecord:
-    """Write the sweep's folder: document, Markdown and figures; raises as :meth:`Results.write` does."""
-    return SWEEPS.write(target, figures, partial(sweep_document, sweep, command))
+SWEEPS = Results("sweep.json", "sweep.md", sweep_document, read_sweep, _shown_as, _drawn)

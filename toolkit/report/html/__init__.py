@@ -40,7 +40,8 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     from toolkit.report.run_directory import read_run
     from toolkit.report.sweep import SWEEPS
 
-    sections = {one: kind.section(one) for kind in (SWEEPS, EXPLANATIONS) for one in directories if kind.is_in(one)}
+    kinds = [(one, kind) for kind in (SWEEPS, EXPLANATIONS) for one in directories if (one / kind.document).is_file()]
+    sections = {directory: kind.section(directory) for directory, kind in kinds}
     runs = [read_run(directory) for directory in directories if directory not in sections]
     write_text(target, page_text(payload_of(runs), "\n".join(sections.values())))
 

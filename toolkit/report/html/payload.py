@@ -15,8 +15,8 @@ from toolkit.answers import STATUS_MEANING
 from toolkit.files import documents
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import ComponentSeries, NeesSeries, look_numbers
+from toolkit.report.headers import usual_metrics
 from toolkit.report.messages import ContestRecord, contest_text
 from toolkit.report.report_json import DrawnMap, DrawnRun
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles, repeated
