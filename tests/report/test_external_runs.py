@@ -22,7 +22,7 @@ from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation,
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import cost, score_run
 from toolkit.report.comparison_table import report_text
-from toolkit.report.figures import over_time
+from toolkit.report.figures.comparison import draw_errors
 from toolkit.report.records import read_metrics
 from toolkit.report.run_directory import MadeBy, write_run
 from toolkit.sequence import Sequence
@@ -225,7 +225,7 @@ def test_without_truth_the_others_are_not_measured_against_it(without_truth: Com
     (read,) = runs_of_others(brought, {}, sequence, sequence)
     other = outcome_of(read, without_truth.sequence, seed=without_truth.seeds[0])
     mixed = replace(without_truth, outcomes=(*without_truth.outcomes, other))
-    (drawn,) = over_time.draw_errors(mixed)
+    (drawn,) = draw_errors(mixed)
     assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
 
 

@@ -15,8 +15,9 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
 from toolkit.report.curves import COLOURS, components, error_curves, look_numbers
-from toolkit.report.figures import FigureFormat, from_above, over_time, save
-from toolkit.report.figures.from_above import NOWHERE, view_of
+from toolkit.report.figures import FigureFormat, save
+from toolkit.report.figures import comparison as drawing
+from toolkit.report.figures.comparison import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
@@ -58,20 +59,20 @@ def map_of(figure: Figure) -> Axes:
 
 
 def test_top_views_have_equal_scale_which_far_landmarks_do_not_squash(comparison: Comparison) -> None:
-    shown = {one.name: one.figure for one in (*from_above.draw_all(comparison), *from_above.draw_each(comparison))}
+    shown = {one.name: one.figure for one in (*drawing.draw_all(comparison), *drawing.draw_each(comparison))}
     assert list(shown) == ["top_all", "top_steady", "top_astray", "top_late"]
     assert all(map_of(figure).get_aspect() == 1.0 for figure in shown.values())
     late = comparison.runs[2]
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
     spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
-    ((_, _, figure),) = from_above.draw_all(compared(comparison.sequence, (spoiled,)))
+    ((_, _, figure),) = drawing.draw_all(compared(comparison.sequence, (spoiled,)))
     low, high = map_of(figure).get_xlim()
     assert high - low < 500.0
 
 
 def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
-    (drawn,) = over_time.draw_errors(comparison)
+    (drawn,) = drawing.draw_errors(comparison)
     _, curves = error_curves(comparison)
     good_m = max(max(errors.position_m) for row, errors in curves.items() if row.status == "ok")
     position, _ = drawn.figure.axes
@@ -79,7 +80,7 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert "astray" in position.get_title(loc="right")
 
 
-@pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])
+@pytest.mark.parametrize("draw", [drawing.draw_errors, drawing.draw_all])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)
@@ -89,9 +90,9 @@ def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: ob
 def test_the_bound_is_drawn_where_it_was_requested(run_estimator) -> None:
     sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
     usual = compared(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
-    assert list(over_time.draw_bound(usual)) == []
+    assert list(drawing.draw_bound(usual)) == []
     requested = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
-    (drawn,) = over_time.draw_bound(requested)
+    (drawn,) = drawing.draw_bound(requested)
     position = drawn.figure.axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
     assert "thin: stated" in [text.get_text() for text in drawn.figure.legends[0].get_texts()]
@@ -133,7 +134,7 @@ def test_components_are_estimate_minus_truth_in_the_worlds_axes_and_stated_devia
 def test_the_band_is_three_deviations_all_of_the_error_is_shown_and_the_share_in_it_is_the_metrics(
     offset: Comparison,
 ) -> None:
-    drawn = (*over_time.draw_telling_components(offset), *over_time.draw_other_components(offset))
+    drawn = (*drawing.draw_telling_components(offset), *drawing.draw_other_components(offset))
     one = next(figure for figure in drawn if figure.name == "components_offset")
     found, axes = of_offset(offset), one.figure.axes[0]
     lower, upper, error = (np.asarray(line.get_ydata()) for line in axes.get_lines()[:3])
@@ -141,7 +142,7 @@ def test_the_band_is_three_deviations_all_of_the_error_is_shown_and_the_share_in
     np.testing.assert_allclose(lower, -upper)
     np.testing.assert_allclose(error, found["x_m"])
     assert axes.get_ylim()[1] > np.abs(error).max()
-    (one,) = over_time.draw_nees(offset)
+    (one,) = drawing.draw_nees(offset)
     (row,) = (row for row in offset.lines if row.estimator == "offset")
     share = row.value("nees_pose_in_band_percent")
     assert share is not None
@@ -155,7 +156,7 @@ def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
     assert np.isfinite(view_of([NOWHERE], NOWHERE)).all()
 
 
-@pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])
+@pytest.mark.parametrize("draw", [drawing.draw_errors, drawing.draw_all])
 def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Comparison, draw: Draw) -> None:
     (one,) = draw(fourteen)
     figure = one.figure

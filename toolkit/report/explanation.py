@@ -274,7 +274,7 @@ def _shown_as(found: ExplanationRecord) -> Shown:
 
 
 def _drawn(found: Explanation) -> "Iterator[NamedFigure]":
-    from toolkit.report.figures.waterfall import draw_explanation  # here alone, for matplotlib takes long to import
+    from toolkit.report.figures.trials import draw_explanation  # here alone, for matplotlib takes long to import
 
     return draw_explanation(explanation_document(found))
 

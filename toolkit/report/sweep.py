@@ -189,7 +189,7 @@ def _shown_as(sweep: SweepRecord) -> Shown:
 
 
 def _drawn(sweep: Sweep) -> "Iterator[NamedFigure]":
-    from toolkit.report.figures.sweeps import draw_sweep  # here alone, for matplotlib takes long to import
+    from toolkit.report.figures.trials import draw_sweep  # here alone, for matplotlib takes long to import
 
     return draw_sweep(sweep)
 

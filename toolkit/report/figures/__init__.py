@@ -1,7 +1,7 @@
 """The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
-Reading order: style -> over_time, from_above; the numbers are those of report.curves. sweeps has
-the figures of a sweep, waterfall that of an explanation, trajectories those of trajectory files.
+Reading order: style -> comparison, whose numbers are those of report.curves; trials has the figures of a sweep and of
+an explanation, trajectories those of trajectory files.
 """
 
 import warnings
@@ -28,23 +28,15 @@ _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
 FigureChoice = Literal["few", "all", "none"]
 
 
-def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[NamedFigure]:
+def drawn(comparison: "Comparison", choice: Literal["few", "all"] = "all") -> Iterator[NamedFigure]:
     """Draw the few most important figures, or all that the comparison has data for, each when it is reached."""
     # With GTSAM, which figures of trajectory files do without.
-    from toolkit.report.figures import from_above, over_time
+    from toolkit.report.figures import comparison as of
 
     # Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
-    few = (
-        from_above.draw_all,
-        over_time.draw_errors,
-        over_time.draw_telling_components,
-        over_time.draw_nees,
-        over_time.draw_bound,
-    )
-    more = (over_time.draw_nis, over_time.draw_other_components, from_above.draw_each)
-    drawings = (over_time.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
-    if choice == "none":
-        drawings = ()
+    few = (of.draw_all, of.draw_errors, of.draw_telling_components, of.draw_nees, of.draw_bound)
+    more = (of.draw_nis, of.draw_other_components, of.draw_each)
+    drawings = (of.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
     return (literal(figure) for drawing in drawings for figure in drawing(comparison))
 
 

@@ -37,6 +37,8 @@ _LINE_OF: dict[Output, tuple[Dashes, ...]] = {
     "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5)), (0.0, (9.0, 1.5, 3.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
+# Of a sample of a line in a legend, wide enough and thin enough for one period of any dashes, in sizes of the type.
+_SAMPLE_EM, _SAMPLE_PT = 3.4, 1.6
 # From this many panels on there are four in a row, before that three; two or four make a square.
 _MANY = 10
 _PANEL_IN = 1.35
@@ -122,16 +124,16 @@ def entries_of(estimators: Iterable[str], drawn: Sequence[tuple[str, Output]]) -
     """Return an entry for each estimator of which outputs are drawn, with the line of the final one where it is."""
     output_of = dict(sorted(drawn, key=lambda pair: pair[1]))  # causal before final
     strokes = {name: stroke_of(estimators, name, output_of[name]) for name, _ in drawn}
-    return [Entry.of_line(name, stroke["color"], stroke["linestyle"], 1.8) for name, stroke in strokes.items()]
+    return [Entry.of_line(name, stroke["color"], stroke["linestyle"], _SAMPLE_PT) for name, stroke in strokes.items()]
 
 
 def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **place: Any) -> Legend:
     """Put a legend somewhere (``loc`` and the like), with as many columns as there is room for unless it is said."""
-    widest_pt = LEGEND_PT * (2.4 + 2.5 + _EM_A_LETTER * max(len(entry.label) for entry in entries))
+    widest_pt = LEGEND_PT * (_SAMPLE_EM + 2.2 + _EM_A_LETTER * max(len(entry.label) for entry in entries))
     return owner.legend(
         handles=[entry.sample for entry in entries],
         labels=[entry.label for entry in entries],
-        handlelength=2.4,
+        handlelength=_SAMPLE_EM,
         ncols=columns or max(1, min(len(entries), int(WIDTH_IN * 72.0 / widest_pt))),
         columnspacing=1.4,
         frameon=False,
