@@ -24,9 +24,9 @@ STATUS_MEANING: Mapping[Status, str] = {
 }
 Output = Literal["causal", "final"]
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
-COV_SIZES = (6, 9, 12, 15)
+_COV_SIZES = (6, 9, 12, 15)
 _STATE: Mapping[str, tuple[tuple[int, ...], ...]] = {"T_world_imu": ((4, 4),), "v_world": ((3,),), "bias": ((6,),)}
-_COVARIANCE = {"cov": tuple((size, size) for size in COV_SIZES)}
+_COVARIANCE = {"cov": tuple((size, size) for size in _COV_SIZES)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +79,11 @@ def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Es
     """
     if answer is None:
         return None
-    check_state(answer, packet.index)
     where = f"of its answer to frame {packet.index}"
+    if not isinstance(answer, Estimate):
+        told = f"its answer to frame {packet.index} is {type_of(answer)}"
+        raise EstimatorError(f"{told}; step returns an Estimate or None")
+    _check_arrays(answer, _STATE, where)
     if not isinstance(answer.t_ns, int | np.integer) or answer.t_ns != packet.frame.t_ns:
         raise EstimatorError(f"t_ns {where} is {answer.t_ns!r}; the frame's is {packet.frame.t_ns}, in whole ns")
     _check_arrays(answer, _COVARIANCE, where)
@@ -92,15 +95,7 @@ def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Es
     for name, value in answer.info.items():
         if not isinstance(name, str) or not isinstance(value, float | int | np.number):
             raise EstimatorError(f"info {where} has {name!r}: {value!r}; it is a dict of numbers by name")
-    estimate: Estimate = answer
-    return estimate
-
-
-def check_state(answer: Any, frame: int) -> None:
-    """Raise EstimatorError where an answer of ``step`` to a frame is no Estimate of a pose, velocity and biases."""
-    if not isinstance(answer, Estimate):
-        raise EstimatorError(f"its answer to frame {frame} is {type_of(answer)}; step returns an Estimate or None")
-    _check_arrays(answer, _STATE, f"of its answer to frame {frame}")
+    return answer
 
 
 def checked_finish(answer: Any, frames_t_ns: IntArray, answered: bool) -> Finished:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import TimeoutError as TookTooLong
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Literal
@@ -26,7 +26,7 @@ from loky.process_executor import BrokenProcessPool
 from msgspec import Meta, Struct
 
 from toolkit import runner
-from toolkit.answers import COV_SIZES, Run, check_state
+from toolkit.answers import Run, checked_estimate, checked_finish
 from toolkit.discovery import FoundModule, shown_name
 from toolkit.errors import EstimatorError, SystemLimitError, in_words, one_line
 from toolkit.estimate import Estimate, Finished
@@ -102,18 +102,17 @@ def setup_of(sequence: Sequence) -> Setup:
 def watch(build: Build, sequence: Sequence) -> Watched:
     """Run an estimator over a recording from its own prior; whatever the estimator raises passes through.
 
-    Raises EstimatorError where an answer is no Estimate, or its pose, velocity or biases have no such shape.
+    Raises EstimatorError where an answer is none that the runner takes.
     """
     setup, packets = setup_of(sequence), tuple(sequence.packets())
     given_copies = _copies_of((setup, packets))
     estimator, online, online_copies = build(setup), list[Estimate | None](), list[tuple[Array, ...]]()
+    last: Estimate | None = None
     for packet in packets:
-        answer = estimator.step(packet)
-        if answer is not None:
-            check_state(answer, packet.index)
-        online.append(answer)
+        online.append(checked_estimate(estimator.step(packet), packet, last))
         online_copies.append(_copies_of(online[-1]))
-    finished = estimator.finish()
+        last = last if online[-1] is None else online[-1]
+    finished = checked_finish(estimator.finish(), sequence.frames_t_ns, last is not None)
     return Watched(build, sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)
 
 
@@ -228,14 +227,11 @@ def not_finite(watched: Watched) -> str:
 
 
 def unsound_covariance(watched: Watched) -> str:
-    """Say which covariance is not finite, of a wrong size, not symmetric or not positive definite."""
+    """Say which covariance is not finite, not symmetric or not positive definite."""
     landmarks = watched.finished.landmarks.cov
     of_landmarks = ((f"landmark {i}", cov) for i, cov in enumerate(() if landmarks is None else landmarks))
-    for stated, sizes in ((_stated(watched), COV_SIZES), (of_landmarks, (3,))):
-        for where, cov in stated:
-            if found := covariance_fault(cov, sizes):
-                return f"the covariance of {where} {found}"
-    return ""
+    found = ((where, covariance_fault(cov)) for where, cov in chain(_stated(watched), of_landmarks))
+    return next((f"the covariance of {where} {fault}" for where, fault in found if fault), "")
 
 
 def _stated(watched: Watched) -> Iterator[tuple[str, Array]]:
@@ -247,13 +243,11 @@ def _stated(watched: Watched) -> Iterator[tuple[str, Array]]:
         yield f"its final state {k}", cov
 
 
-def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
-    """Say what is wrong with a covariance (d, d), d one of the sizes; nothing where it is sound.
+def covariance_fault(cov: Array) -> str:
+    """Say what is wrong with a covariance (d, d); nothing where it is sound.
 
     Units differ by orders of magnitude: what must be positive definite is the matrix of correlations.
     """
-    if cov.ndim != 2 or cov.shape[0] != cov.shape[1] or len(cov) not in sizes:
-        return f"has the shape {cov.shape}; expected {' or '.join(f'{n} x {n}' for n in sizes)}"
     if not np.isfinite(cov).all():
         return "is not finite"
     variances = np.diagonal(cov)
@@ -281,20 +275,15 @@ def no_rotation(watched: Watched) -> str:
 
 
 def wrong_stamps(watched: Watched) -> str:
-    """Say at which frame an answer is missing, or has the stamp of another frame."""
+    """Say how many frames have no answer; that each has the stamp of its frame is checked where it is received."""
     frames_t_ns = watched.sequence.frames_t_ns
     silent = sum(answer is None for answer in watched.online)
     if silent not in (0, len(watched.online)):
         return f"it answers at {len(watched.online) - silent} of {len(watched.online)} frames; answer at each, or none"
-    for k, answer in enumerate(watched.online):
-        if answer is not None and answer.t_ns != frames_t_ns[k]:
-            return f"its answer to frame {k} has the stamp {answer.t_ns} ns, the frame has {frames_t_ns[k]} ns"
     final = watched.finished.trajectory
-    if not np.array_equal(final.t_ns, frames_t_ns) or final.T_world_imu.shape != (frames_t_ns.size, 4, 4):
-        return (
-            f"its final trajectory has {len(final)} states, and there are {frames_t_ns.size} frames with their stamps"
-        )
-    return ""
+    if np.array_equal(final.t_ns, frames_t_ns):
+        return ""
+    return f"its final trajectory has {len(final)} states, and there are {frames_t_ns.size} frames with their stamps"
 
 
 def gave_up(run: Run, frames_t_ns: IntArray) -> str:

@@ -1,6 +1,7 @@
 """The documents of a run are those that their contracts describe: written, read back, refused with the place."""
 
 import json
+import runpy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from toolkit.metrics import Evaluation, Scores, describe
 from toolkit.metrics.parts.consistency import body_errors
 from toolkit.report.curves import components
 from toolkit.report.messages import note_lines
-from toolkit.report.records import RECORDS, read_card, read_check, read_manifest, schema_files
+from toolkit.report.records import read_card, read_check, read_manifest
 from toolkit.report.report_json import report_document
 from toolkit.report.scores import MetricsDocument, metrics_document
 from toolkit.settings import Noise, Settings
@@ -32,7 +33,9 @@ Document = dict[str, Any]
 # Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records; card and sweep
 # by the first command that made one of its version.
 OLD = Path(__file__).parent / "documents"
-SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
+DOCS = Path(__file__).parents[2] / "docs"
+SCHEMAS, MADE = DOCS / "schemas", runpy.run_path(str(DOCS / "site/schemas.py"))
+RECORDS: dict[str, type[msgspec.Struct]] = MADE["RECORDS"]
 OF_KIND = {name.rpartition("-")[0]: name for name in RECORDS} | {"manifest-over-seeds": "manifest-1"}
 CASES = {path.name: OF_KIND[path.stem] for path in sorted(OLD.iterdir())}
 # Baselines are made to be reviewed, and laid out otherwise than other documents.
@@ -111,8 +114,8 @@ def test_a_document_without_any_one_of_its_fields_is_refused(name: str) -> None:
 
 
 def test_the_published_schemas_are_those_of_the_records() -> None:
-    reported = "docs/schemas differs from the records: python -m toolkit.report.records docs/schemas renews it"
-    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), reported
+    reported = "docs/schemas differs from the records: python docs/site/schemas.py renews it"
+    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == MADE["schema_files"](), reported
 
 
 # What the records check beyond their types: those are msgspec's, and tests/files has how it words them.

@@ -17,7 +17,7 @@ from toolkit.files.writing import write_text
 from toolkit.gate.checking import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, filled, number, section
+from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, filled, number, section, unit_of
 from toolkit.verify import VerificationRecord
 
 _FAILED: Mapping[Finding, str] = {
@@ -28,8 +28,8 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
-# A length below this (m) is written in millimetres; a value has at most this many digits.
-_SHORT_M, _MOST_DIGITS = 0.1, 7
+# A value has at most this many digits.
+_MOST_DIGITS = 7
 _NUMBERS = (
     ("before", "", ""),
     ("now", "", ""),
@@ -84,9 +84,7 @@ def _values(verdict: Verdict) -> tuple[str, str]:
     """Return the value before and now with their unit, and with enough digits that a difference shows."""
     given = [value for value in (verdict.before, verdict.after) if value is not None and math.isfinite(value)]
     metric = _metrics().get(verdict.metric)
-    unit, factor = metric.unit if metric is not None and metric.unit != "1" else "", 1.0
-    if unit == "m" and max(map(abs, given), default=1.0) < _SHORT_M:
-        unit, factor = "mm", 1e3
+    unit, factor = ("", 1.0) if metric is None or metric.unit == "1" else unit_of(metric, given)
     digits = DIGITS
     if len(given) == 2 and verdict.finding != "same" and given[0] != given[1] and all(given):
         largest, difference = (
