@@ -17,7 +17,19 @@ from toolkit.files.writing import write_text
 from toolkit.gate.checking import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, filled, number, section, unit_of
+from toolkit.report.text import (
+    DIGITS,
+    MISSING,
+    WIDTH,
+    Table,
+    Width,
+    as_markdown,
+    as_text,
+    filled,
+    number,
+    section,
+    unit_of,
+)
 from toolkit.verify import VerificationRecord
 
 _FAILED: Mapping[Finding, str] = {
