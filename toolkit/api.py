@@ -140,9 +140,7 @@ def sweep(
 
     Raises as :func:`compare` does, and SettingsError for a fault or a value there is not.
     """
-    if strange := sorted(options.keys() - SweepOptions.__annotations__.keys()):
-        raise SettingsError(no_such("argument", strange[0], SweepOptions.__annotations__))
-    plan, kept = _planned(source, estimators, **options)
+    plan, kept = _planned(source, estimators, **_checked(options))
     return SweepResult(run_sweep(plan, over, crossed=not each, directory=kept))
 
 
@@ -166,8 +164,15 @@ def explain(
             "own has functions, which cannot say what they have; give the path of a file with INGREDIENTS"
         )
     usual = default_ends() if None in (start, goal) else ("", "")
-    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, **options)
+    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, **_checked(options))
     return ExplainResult(run_explanation(plan, str(start or usual[0]), str(goal or usual[1]), kept))
+
+
+def _checked(options: SweepOptions) -> SweepOptions:
+    """Return what was given by name; SettingsError for what only a comparison takes, or nothing."""
+    if strange := sorted(options.keys() - SweepOptions.__annotations__.keys()):
+        raise SettingsError(no_such("argument", strange[0], SweepOptions.__annotations__))
+    return options
 
 
 def _planned(source: Source, estimators: Names | None, **options: Any) -> tuple[Plan, Path | None]:

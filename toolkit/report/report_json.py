@@ -14,29 +14,8 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
+from toolkit.report import curves
 from toolkit.report.card import CardRecord, card_record
-from toolkit.report.curves import (
-    NOT_ALIGNED,
-    Columns,
-    ComponentSeries,
-    ErrorKind,
-    ErrorSeries,
-    NeesSeries,
-    NisSeries,
-    Numbers,
-    Times,
-    alignment_text,
-    check_lengths,
-    components,
-    computed_or_reason,
-    error_curves,
-    nees_series,
-    nis_series,
-    onto_truth,
-    seconds,
-    shown_output,
-    truth_during,
-)
 from toolkit.report.headers import header_lines, noise_line, sequence_line
 from toolkit.report.messages import (
     ContestRecord,
@@ -62,20 +41,22 @@ class DrawnRun(Struct, frozen=True, kw_only=True):
     trajectory: Annotated[str | None, Meta(description="its TUM file in the run directory")]
     rotation: Annotated[tuple[Vector, Vector, Vector], Meta(description="of its alignment, rows")]
     translation_m: Annotated[Vector, Meta(description="rotation times a position plus this is in the truth's world")]
-    errors: Annotated[ErrorSeries | None, Meta(description="null where there are none, or with the causal entry")]
-    nees: Annotated[NeesSeries | str, Meta(description="or why there is none")]
-    nis: Annotated[NisSeries | str, Meta(description="or why there is none")]
+    errors: Annotated[
+        curves.ErrorSeries | None, Meta(description="null where there are none, or with the causal entry")
+    ]
+    nees: Annotated[curves.NeesSeries | str, Meta(description="or why there is none")]
+    nis: Annotated[curves.NisSeries | str, Meta(description="or why there is none")]
     components: Annotated[
-        ComponentSeries | UnsetType, Meta(description="absent where none, or with the causal entry")
+        curves.ComponentSeries | UnsetType, Meta(description="absent where none, or with the causal entry")
     ] = UNSET
 
 
-class StepTimes(Columns, frozen=True, kw_only=True):
+class StepTimes(curves.Columns, frozen=True, kw_only=True):
     """The wall clock of an estimator's steps."""
 
     estimator: str
-    t_s: Times
-    step_ms: Numbers
+    t_s: curves.Times
+    step_ms: curves.Numbers
     finish_s: float | None
 
 
@@ -121,7 +102,7 @@ class Report(Struct, frozen=True, kw_only=True):
     start_ns: Annotated[int, Meta(description="stamp of the first frame")]
     truth: Annotated[str | None, Meta(description="the truth while the camera ran, a TUM file in the run directory")]
     alignment: Annotated[str, Meta(description="in words, how estimates are laid over the truth")]
-    error: Annotated[ErrorKind | None, Meta(description="null where there are no errors")]
+    error: Annotated[curves.ErrorKind | None, Meta(description="null where there are no errors")]
     runs: Annotated[tuple[DrawnRun, ...], Meta(description="one for each of metrics.json, in its order")]
     steps: tuple[StepTimes, ...]
     maps: tuple[DrawnMap, ...]
@@ -130,12 +111,12 @@ class Report(Struct, frozen=True, kw_only=True):
     contests: Contests = UNSET
 
 
-class MeanNeesSeries(Columns, frozen=True, kw_only=True):
+class MeanNeesSeries(curves.Columns, frozen=True, kw_only=True):
     """Pose NEES over 6, averaged over the seeds, with its 95 % band for as many runs."""
 
-    pose: Numbers
-    low: Numbers
-    high: Numbers
+    pose: curves.Numbers
+    low: curves.Numbers
+    high: curves.Numbers
 
 
 class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
@@ -144,7 +125,7 @@ class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
     estimator: str
     output: Output
     nees: MeanNeesSeries | None
-    position_rms_m: Annotated[Numbers | None, Meta(description="RMS over the seeds, from the common start")]
+    position_rms_m: Annotated[curves.Numbers | None, Meta(description="RMS over the seeds, from the common start")]
 
 
 class SeedsMessages(Struct, frozen=True, kw_only=True):
@@ -161,7 +142,7 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
     """What the report of a comparison over seeds draws and says."""
 
     schema: Literal["vislam.report/1"]
-    t_s: Annotated[Times, Meta(description="of the frames")]
+    t_s: Annotated[curves.Times, Meta(description="of the frames")]
     runs: Annotated[tuple[DrawnOverSeeds, ...], Meta(description="one for each of seeds.json, in its order")]
     words: SeedsMessages
     contests: Contests = UNSET
@@ -170,7 +151,7 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
         for i, run in enumerate(self.runs):
             nees = {} if run.nees is None else {f"runs[{i}].nees.pose": run.nees.pose}
             errors = {} if run.position_rms_m is None else {f"runs[{i}].position_rms_m": run.position_rms_m}
-            check_lengths({"t_s": self.t_s, **nees, **errors})
+            curves.check_lengths({"t_s": self.t_s, **nees, **errors})
 
 
 read_report = reader(Report, REPEAT)
@@ -186,18 +167,18 @@ def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, 
 
 
 def report_document(comparison: Comparison) -> Report:
-    kind, errors = error_curves(comparison)
+    kind, errors = curves.error_curves(comparison)
     return Report(
         schema="vislam.report/1",
         start_ns=int(comparison.sequence.frames_t_ns[0]),
-        truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
-        alignment=alignment_text(comparison.sequence),
+        truth=None if curves.truth_during(comparison.sequence) is None else TRUTH_FILE,
+        alignment=curves.alignment_text(comparison.sequence),
         error=kind,
         runs=tuple(_row(row, comparison, errors.get(row)) for row in comparison.rows),
         steps=tuple(
             StepTimes(
                 estimator=run.estimator,
-                t_s=seconds(comparison.sequence, comparison.sequence.frames_t_ns[: run.timings.step_s.size]),
+                t_s=curves.seconds(comparison.sequence, comparison.sequence.frames_t_ns[: run.timings.step_s.size]),
                 step_ms=numbers(1e3 * run.timings.step_s),
                 finish_s=number(run.timings.finish_s),
             )
@@ -205,7 +186,9 @@ def report_document(comparison: Comparison) -> Report:
             if run.timings is not None and run.timings.step_s.size
         ),
         maps=tuple(
-            DrawnMap(estimator=run.estimator, landmarks=file_of("landmarks", run.estimator), output=shown_output(run))
+            DrawnMap(
+                estimator=run.estimator, landmarks=file_of("landmarks", run.estimator), output=curves.shown_output(run)
+            )
             for run in comparison.runs
             if len(run.landmarks)
         ),
@@ -241,9 +224,9 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
     )
 
 
-def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnRun:
+def _row(row: Row, comparison: Comparison, errors: curves.ErrorSeries | None) -> DrawnRun:
     answered = row.run.trajectory(row.output) is not None
-    alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else NOT_ALIGNED
+    alignment = curves.onto_truth(row.run, row.output, comparison.sequence) if answered else curves.NOT_ALIGNED
     return DrawnRun(
         estimator=row.estimator,
         output=row.output,
@@ -252,9 +235,9 @@ def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnR
         rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
         translation_m=_vector(alignment.translation),
         errors=errors,
-        nees=computed_or_reason(nees_series, row.run, row.output, comparison.sequence),
-        nis=computed_or_reason(nis_series, row.run, row.output, comparison.sequence),
-        components=(None if row.repeats_causal else components(comparison, row)) or UNSET,
+        nees=curves.computed_or_reason(curves.nees_series, row.run, row.output, comparison.sequence),
+        nis=curves.computed_or_reason(curves.nis_series, row.run, row.output, comparison.sequence),
+        components=(None if row.repeats_causal else curves.components(comparison, row)) or UNSET,
     )
 
 

@@ -22,21 +22,7 @@ from toolkit.geometry import Array
 from toolkit.metrics.bound import against_bound
 from toolkit.metrics.parts.evaluation import rmse
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.curves import (
-    COMPONENTS,
-    Numbers,
-    alignment_text,
-    available,
-    components,
-    error_curves,
-    nees_series,
-    nis_series,
-    onto_truth,
-    reference_estimate,
-    shown_as,
-    shown_output,
-    truth_during,
-)
+from toolkit.report import curves
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
@@ -61,7 +47,7 @@ _LEAST = 1e-3
 
 def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     """Return x and y (M, 2) of the finite ones among points (N, 3), moved with the run onto the truth."""
-    alignment = onto_truth(run, shown_output(run), comparison.sequence)
+    alignment = curves.onto_truth(run, curves.shown_output(run), comparison.sequence)
     finite = points_world[np.isfinite(points_world).all(axis=1)]
     above: Array = (finite @ alignment.rotation.T + alignment.translation)[:, :2]
     return above
@@ -82,12 +68,12 @@ def view_of(tracks: Sequence[Array], landmarks: Array) -> tuple[Array, Array]:
 
 def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield all trajectories in one figure, over the landmarks of the last run that is ok and has some."""
-    runs = [run for run in comparison.runs if run.trajectory(shown_output(run)) is not None]
+    runs = [run for run in comparison.runs if run.trajectory(curves.shown_output(run)) is not None]
     if not runs:
         return
     mapper = next((run for run in reversed(runs) if run.status == "ok" and len(run.landmarks)), None)
     of_whom = "" if mapper is None else f" over the landmarks of {mapper.estimator}"
-    caption = f"All trajectories{of_whom}, each from its dot on. {alignment_text(comparison.sequence)}"
+    caption = f"All trajectories{of_whom}, each from its dot on. {curves.alignment_text(comparison.sequence)}"
     if any(run.status != "ok" for run in runs):
         caption += " One that is not ok may leave the picture."
     title = f"{comparison.name}: all estimators, from above"
@@ -97,18 +83,18 @@ def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
 def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield a top view for each run that has a trajectory, over its own landmarks."""
     for run in comparison.runs:
-        if run.trajectory(shown_output(run)) is not None:
+        if run.trajectory(curves.shown_output(run)) is not None:
             map_size = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
             where = f"Trajectory of {run.estimator} from above, from the dot on"
             figure = _map(comparison, [run], run, f"{_name(run)} on {comparison.name}, from above")
-            caption = f"{where}; {map_size}. {alignment_text(comparison.sequence)}"
+            caption = f"{where}; {map_size}. {curves.alignment_text(comparison.sequence)}"
             yield NamedFigure(f"top_{plain_name(run.estimator)}", caption, figure)
 
 
 def _map(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title: str) -> Figure:
-    during = truth_during(comparison.sequence)
+    during = curves.truth_during(comparison.sequence)
     truth = NOWHERE if during is None else during.T_world_imu[:, :2, 3]
-    answers = [(run, run.trajectory(shown_output(run))) for run in runs]
+    answers = [(run, run.trajectory(curves.shown_output(run))) for run in runs]
     tracks = [NOWHERE if one is None else from_above(comparison, run, one.positions) for run, one in answers]
     # A run that diverged would squash all the others; its own figure shows where it went.
     shown = [track for track, run in zip(tracks, runs, strict=True) if run.status == "ok" or len(runs) == 1]
@@ -122,7 +108,7 @@ def _map(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title:
         entries.append(Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH))
     for run, track in zip(runs, tracks, strict=True):
         width = _LINE_WIDTH if len(runs) == 1 else style.width_of(comparison, run.estimator)
-        stroke = style.stroke_of(comparison.estimators, run.estimator, shown_output(run))
+        stroke = style.stroke_of(comparison.estimators, run.estimator, curves.shown_output(run))
         axes.plot(*track.T, linewidth=width, zorder=3, **stroke)
         axes.plot(*track[:1].T, "o", color=stroke["color"], ms=5.0, markeredgecolor="white", zorder=4)
         entries.append(Entry.of_line(_name(run), stroke["color"], stroke["linestyle"], 1.8))
@@ -143,30 +129,30 @@ def _name(run: Run) -> str:
 
 def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
-    kind, curves = error_curves(comparison)
+    kind, found = curves.error_curves(comparison)
     if kind is None:
         return
     figure = style.new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
-    position_m = {row: _known(errors.position_m) for row, errors in curves.items()}
-    heading_deg = {row: np.abs(_known(errors.heading_deg)) for row, errors in curves.items()}
+    position_m = {row: _known(errors.position_m) for row, errors in found.items()}
+    heading_deg = {row: np.abs(_known(errors.heading_deg)) for row, errors in found.items()}
     for axes, unit, of_rows in ((position, "m", position_m), (heading, "deg", heading_deg)):
         for row, sizes in of_rows.items():
-            stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
+            stroke = style.stroke_of(comparison.estimators, row.estimator, curves.shown_as(row))
             width = style.width_of(comparison, row.estimator)
-            axes.plot(curves[row].t_s, sizes, linewidth=width, **stroke)
+            axes.plot(found[row].t_s, sizes, linewidth=width, **stroke)
         _scale(axes, of_rows, unit)
     style.label_axes(position, f"{comparison.name}: position {kind.what}, {kind.placing}", "", "position [m]")
     style.label_axes(heading, f"size of the heading {kind.what}", "time [s]", "|heading| [deg]")
     figure.align_ylabels()
     told = {row.estimator: f"{number(rmse(sizes))} m" for row, sizes in position_m.items()}
-    entries = style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row in curves])
+    entries = style.entries_of(comparison.estimators, [(row.estimator, curves.shown_as(row)) for row in found])
     style.legend_below(figure, [entry._replace(label=f"{entry.label}: {told[entry.label]}") for entry in entries])
     caption = f"Position and heading {kind.what} over time, in the legend the RMS of the position, of the final output"
     yield NamedFigure("errors_over_time", f"{caption} where there is one. {kind.caption}", figure)
 
 
-def _known(values: Numbers) -> Array:
+def _known(values: curves.Numbers) -> Array:
     return np.array(values, dtype=float)
 
 
@@ -203,20 +189,20 @@ def _telling(comparison: Comparison) -> list[str]:
 
 def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
     rows = [row for row in comparison.lines if row.estimator == name]
-    found = [(row, one) for row in rows if (one := components(comparison, row)) is not None]
+    found = [(row, one) for row in rows if (one := curves.components(comparison, row)) is not None]
     if not found:
         return
-    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
+    reference = None if comparison.sequence.truth is not None else curves.reference_estimate(comparison)
     what = "error" if reference is None else f"difference from {reference.name}"
     figure, colour, entries = style.new_figure(4.6), style.stroke_of(comparison.estimators, name)["color"], []
     grid = figure.subplots(3, 2, sharex=True)
     in_order = [*grid[:, 1], *grid[:, 0]]  # rotations first, as in COMPONENTS
-    shown: dict[str, list[tuple[Array, Array]]] = {name: [] for name in COMPONENTS}
+    shown: dict[str, list[tuple[Array, Array]]] = {name: [] for name in curves.COMPONENTS}
     for row, one in found:
-        output, columns = shown_as(row), {name: _known(column) for name, column in asdict(one).items()}
+        output, columns = curves.shown_as(row), {name: _known(column) for name, column in asdict(one).items()}
         line, alpha = style.line_of(output), _BAND_ALPHA if output == "final" else 0.0
         label, is_stated = "causal = final" if row.label == "both" else row.output, False
-        for column, axes in zip(COMPONENTS, in_order, strict=True):
+        for column, axes in zip(curves.COMPONENTS, in_order, strict=True):
             error, band = columns[column], _SIGMAS * columns[f"sigma_{column}"]
             if np.isfinite(band).any():
                 is_stated = True
@@ -228,7 +214,7 @@ def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
         if is_stated:
             filled = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
             entries.append(Entry(f"{label}: ± 3 standard deviations", filled))
-    for i, (column, axes) in enumerate(zip(COMPONENTS, in_order, strict=True)):
+    for i, (column, axes) in enumerate(zip(curves.COMPONENTS, in_order, strict=True)):
         _limit(axes, shown[column])
         axis = f"about {'xyz'[i]} [deg]" if i < len("xyz") else f"{'xyz'[i - 3]} [m]"
         style.label_axes(axes, "", "time [s]" if i % 3 == 2 else "", axis)
@@ -277,7 +263,7 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
     found = [
         (row, one)
         for row in comparison.lines
-        if (one := available(against_bound, row.run, row.output, comparison.sequence)) is not None
+        if (one := curves.available(against_bound, row.run, row.output, comparison.sequence)) is not None
     ]
     if not found:
         return
@@ -288,7 +274,7 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
             t_s = comparison.sequence.elapsed_s(one.t_ns)
-            stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
+            stroke = style.stroke_of(comparison.estimators, row.estimator, curves.shown_as(row))
             lost = np.linalg.norm(one.excess[:, block], axis=1)
             axes.plot(t_s, scale * lost, linewidth=1.6, label=f"{row.estimator} {row.label}", **stroke)
             axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
@@ -303,7 +289,7 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
     style.label_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     entries = [Entry.of_line(f"bound {output}", style.TRUTH_COLOUR, style.line_of(output), 2.0) for output in outputs]
-    entries += style.entries_of(comparison.estimators, [(row.estimator, shown_as(row)) for row, _ in found])
+    entries += style.entries_of(comparison.estimators, [(row.estimator, curves.shown_as(row)) for row, _ in found])
     entries += [Entry.of_line("thin: stated", style.MUTED_COLOUR, width=_STATED_WIDTH)]
     style.legend_below(figure, entries)
     yield NamedFigure("against_bound", _OF_BOUND, figure)
@@ -354,13 +340,13 @@ def _in_bands(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], w
         axes, colour = panels[row.estimator], style.stroke_of(comparison.estimators, row.estimator)["color"]
         shown = np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
-        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(shown_as(row)), linewidth=1.0)
+        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(curves.shown_as(row)), linewidth=1.0)
         shares.setdefault(row.estimator, []).append(f"{series.in_band_percent:.0f} %")
         style.annotate(axes, ", ".join(shares[row.estimator]))
         least = float(np.fmin.reduce(np.append(shown, series.low), initial=least))
         most = float(np.fmax.reduce(np.append(shown, series.high), initial=most))
     style.scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
-    entries = style.output_entries({shown_as(row) for row, _ in found})
+    entries = style.output_entries({curves.shown_as(row) for row, _ in found})
     seeds = f", {len(comparison.seeds)} seeds: mean" if comparison.over_seeds else ":"
     band = Entry("95 % band", Patch(color=style.BAND_COLOUR, linewidth=0.0))
     style.finish(figure, panels, what, f"{comparison.name}{seeds} {what}", [*entries, band])
@@ -371,7 +357,7 @@ def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
     found = [
         (row, Normalised(series.t_s, _known(series.pose), *series.band))
         for row in comparison.lines
-        if (series := available(nees_series, row.run, row.output, comparison.sequence)) is not None
+        if (series := curves.available(curves.nees_series, row.run, row.output, comparison.sequence)) is not None
     ]
     if found:
         yield NamedFigure("nees_over_time", _OF_NEES, _in_bands(comparison, found, "pose NEES / 6"))
@@ -381,7 +367,7 @@ def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
     found = [
         (row, Normalised(series.t_s, *map(_known, (series.per_dof, series.low, series.high))))
         for row in comparison.lines
-        if (series := available(nis_series, row.run, row.output, comparison.sequence)) is not None
+        if (series := curves.available(curves.nis_series, row.run, row.output, comparison.sequence)) is not None
     ]
     if found:
         yield NamedFigure("nis_over_time", _OF_NIS, _in_bands(comparison, found, "NIS / expected"))
@@ -412,7 +398,7 @@ def _errors_over_seeds(over: Comparison) -> NamedFigure:
             continue
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
-        kind = shown_as(group)
+        kind = curves.shown_as(group)
         axes, t_s = panels[group.estimator], over.sequence.frames_s[known]
         colour = style.stroke_of(over.estimators, group.estimator)["color"]
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
