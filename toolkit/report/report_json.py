@@ -14,18 +14,9 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
-from toolkit.report import curves
+from toolkit.report import curves, messages
 from toolkit.report.card import CardRecord, card_record
 from toolkit.report.headers import header_lines, noise_line, sequence_line
-from toolkit.report.messages import (
-    ContestRecord,
-    consistency_lines,
-    contest_record,
-    note_lines,
-    outcome,
-    remark_lines,
-    verdict,
-)
 from toolkit.report.scores import REPEAT, Undecided
 
 TRUTH_FILE = "trajectories/truth.tum"
@@ -78,7 +69,7 @@ class AuditMessage(Struct, frozen=True, kw_only=True):
 
 
 VerdictText = Annotated[str, Meta(description="in words; absent before it was added")] | UnsetType
-Contests = Annotated[tuple[ContestRecord, ...] | UnsetType, Meta(description="who wins, or that nobody does")]
+Contests = Annotated[tuple[messages.ContestRecord, ...] | UnsetType, Meta(description="who wins, or that nobody does")]
 
 
 class Messages(Struct, frozen=True, kw_only=True):
@@ -194,17 +185,17 @@ def report_document(comparison: Comparison) -> Report:
         ),
         words=Messages(
             sequence=f"{sequence_line(comparison.sequence)}; {noise_line(comparison)}",
-            verdict=verdict(comparison),
-            notes=tuple(note_lines(comparison)),
-            remarks=tuple(remark_lines(comparison)),
+            verdict=messages.verdict(comparison),
+            notes=tuple(messages.note_lines(comparison)),
+            remarks=tuple(messages.remark_lines(comparison)),
             start=comparison.prior.source,
-            audit=tuple(of_attributes(AuditMessage, one, outcome=outcome(one)) for one in comparison.findings),
+            audit=tuple(of_attributes(AuditMessage, one, outcome=messages.outcome(one)) for one in comparison.findings),
             undecided=dict(comparison.undecided),
             facts=comparison.sequence.provenance.facts,
             changes=dict(comparison.changes),
         ),
         card=UNSET if comparison.card is None else card_record(comparison.card),
-        contests=tuple(contest_record(one) for one in comparison.contests),
+        contests=tuple(messages.contest_record(one) for one in comparison.contests),
     )
 
 
@@ -215,12 +206,12 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
         runs=tuple(_over_seeds(group) for group in over.rows),
         words=SeedsMessages(
             sequence="; ".join(header_lines(over)),
-            verdict=verdict(over),
-            notes=tuple(note_lines(over)),
-            verdicts=tuple(consistency_lines(over)),
+            verdict=messages.verdict(over),
+            notes=tuple(messages.note_lines(over)),
+            verdicts=tuple(messages.consistency_lines(over)),
             start=over.prior.source,
         ),
-        contests=tuple(contest_record(one) for one in over.contests),
+        contests=tuple(messages.contest_record(one) for one in over.contests),
     )
 
 
