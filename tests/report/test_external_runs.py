@@ -61,22 +61,6 @@ def refusal(folder: Path, trajectory: Trajectory, recording: Sequence, name: str
     return message
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_the_truth_in_any_format_is_without_error_and_says_what_it_cannot_tell(
-    tmp_path: Path, recording: Sequence, name: str
-) -> None:
-    run = read_as_run(tmp_path, truth_of(recording), recording, name)
-    assert (run.causal, run.timings, run.status) == (None, None, "ok")
-    scores = score_run(run, "final", recording)
-    assert scores.values["ate_none_m"] == pytest.approx(0.0, abs=1e-9)
-    assert scores.values["coverage_percent"] == 100.0
-    assert scores.values["pairs"] == recording.frame_count
-    assert scores.notes["nees_pose_mean"] == "the estimator states no covariance"
-    assert scores.notes["total_s"] == "not run here"
-    assert "not run here" in run.log[0]
-    assert "listed as final" in run.log[1]
-
-
 def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording: Sequence) -> None:
     truth, frames_t_ns = truth_of(recording), recording.frames_t_ns
     often_ns = np.arange(frames_t_ns[0] + 3_000_000, frames_t_ns[-1], FREQUENT_NS)
