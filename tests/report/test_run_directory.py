@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 
 from toolkit.errors import OutputError
 from toolkit.experiment.comparison import Comparison
+from toolkit.files.writing import check_replaceable
 from toolkit.report import figures, run_directory
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
-from toolkit.report.run_directory import MadeBy, check_run_directory, write_run
+from toolkit.report.run_directory import MadeBy, write_run, written_by_us
 from toolkit.report.scores import metrics_document
 
 # Where it does not matter which figures there are, and what is in their files.
@@ -97,7 +98,7 @@ def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
 ) -> None:
     target = tmp_path / "run"
     write(comparison, target)
-    check_run_directory(target)
+    check_replaceable(target, written_by_us)
     (target / name).parent.mkdir(exist_ok=True)
     if name == "report.md":  # a link in the place of a file of ours
         (target / name).replace(tmp_path.parent / "mine.md")
@@ -105,7 +106,7 @@ def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
     (target / name).write_text("years of work")
     first = name.partition("/")[0] if name.startswith("raw") else name
     with pytest.raises(OutputError, match=f"holds other files, as {re.escape(first)},"):
-        check_run_directory(target)
+        check_replaceable(target, written_by_us)
     with pytest.raises(OutputError, match="would be lost"):
         write(comparison, target)
     assert (target / name).read_text() == "years of work"
@@ -119,7 +120,7 @@ def test_what_is_not_ours_is_refused(tmp_path: Path, name: str) -> None:
     file.write_text("{}")
     for target in (file.parent, file, file / "run"):
         with pytest.raises(OutputError):
-            check_run_directory(target)
+            check_replaceable(target, written_by_us)
     assert file.read_text() == "{}"
 
 

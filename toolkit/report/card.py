@@ -4,12 +4,11 @@ from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType, convert
 
 from toolkit.audit import Audit
 from toolkit.errors import printable
 from toolkit.files.documents import number, reader, rounded
-from toolkit.geometry import Array
 from toolkit.noise import Card
 from toolkit.report.headers import sequence_line, tracks_measured
 from toolkit.report.messages import outcome, undecided_lines
@@ -133,8 +132,8 @@ def card_record(card: Card) -> CardRecord:
         schema="vislam.card/2",
         tracks=card.tracks,
         tracks_a_frame=rounded(card.a_frame),
-        seen_frames=_three(card.seen_frames),
-        depth_m=_three(card.depth_m),
+        seen_frames=convert([rounded(one) for one in card.seen_frames.tolist()], Quantiles),
+        depth_m=convert([rounded(one) for one in card.depth_m.tolist()], Quantiles),
         intervals=card.intervals,
         intervals_without_common_track=card.blind_intervals,
         correlated=card.correlated,
@@ -148,8 +147,3 @@ def card_record(card: Card) -> CardRecord:
         scale_error=None if scale is None else rounded(scale.error),
         words=tuple(card_lines(card)),
     )
-
-
-def _three(values: Array) -> tuple[float, float, float]:
-    first, second, third = map(rounded, values.tolist())
-    return first, second, third

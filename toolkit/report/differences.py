@@ -16,7 +16,6 @@ from toolkit.experiment.statistics import holm
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats
 from toolkit.gate.verdict import Where
-from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.run_directory import RunFiles, SeedsFiles, repeated
 from toolkit.report.scores import MetricOverSeeds
@@ -178,11 +177,8 @@ def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> flo
     if min(len(was), len(is_)) < FEWEST_RUNS:
         return None
     criterion = Criterion("larger", 100.0 * ROUNDING)
-    return Repeats(Where("", "", "", metric.key), criterion, _array(was), _array(is_)).moved_p()
-
-
-def _array(values: Mapping[int, float]) -> Array:
-    return np.array(list(values.values()))
+    sides = (np.array(list(side.values())) for side in (was, is_))
+    return Repeats(Where("", "", "", metric.key), criterion, *sides).moved_p()
 
 
 def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[ChangeRecord]:

@@ -52,16 +52,6 @@ _NUMBERS = (
 )
 
 
-def gate_table(check: Check) -> Table:
-    return Table((*_LABELS, *_NUMBERS), tuple(map(_row, check.verdicts)), labels=len(_LABELS))
-
-
-def failures_table(check: Check) -> Table:
-    rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failing)
-    headings = (*_LABELS, *_NUMBERS, ("why", "", ""))
-    return Table(headings, rows, labels=len(_LABELS))
-
-
 def printed_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield the lines of a table for a terminal: what the verdicts are of stands above them, and no name is folded."""
     rows = tuple(_row(verdict)[3:] for verdict in verdicts)
@@ -219,9 +209,10 @@ def gate_markdown(check: Check) -> str:
     mark, line = "✅" if check.passed else "❌", headline(check)
     parts = [f"## {mark} Accuracy gate", f"{line[0].upper()}{line[1:]}."]
     if check.failing:
-        parts.append(as_markdown(failures_table(check)))
+        rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failing)
+        parts.append(as_markdown(Table((*_LABELS, *_NUMBERS, ("why", "", "")), rows, labels=len(_LABELS))))
     parts.append("\n".join(f"- {line}" for line in note_lines(check)))
-    everything = as_markdown(gate_table(check))
+    everything = as_markdown(Table((*_LABELS, *_NUMBERS), tuple(map(_row, check.verdicts)), labels=len(_LABELS)))
     parts.append(f"<details>\n<summary>All {len(check.verdicts)} comparisons</summary>\n\n{everything}\n\n</details>")
     return "\n\n".join(parts) + "\n"
 

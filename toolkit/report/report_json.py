@@ -7,13 +7,12 @@ Times ``t_s`` count from the first frame; numbers have six digits; a value that 
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType, convert
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
-from toolkit.geometry import Array
 from toolkit.report import curves, messages
 from toolkit.report.card import CardRecord, card_record
 from toolkit.report.headers import header_lines, noise_line, sequence_line
@@ -223,18 +222,13 @@ def _row(row: Row, comparison: Comparison, errors: curves.ErrorSeries | None) ->
         output=row.output,
         repeats_causal=row.output == "final" and row.run.final_is_causal,
         trajectory=file_of("trajectory", row.estimator, row.output) if answered else None,
-        rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
-        translation_m=_vector(alignment.translation),
+        rotation=convert(alignment.rotation.tolist(), tuple[Vector, Vector, Vector]),
+        translation_m=convert(alignment.translation.tolist(), Vector),
         errors=errors,
         nees=curves.computed_or_reason(curves.nees_series, row.run, row.output, comparison.sequence),
         nis=curves.computed_or_reason(curves.nis_series, row.run, row.output, comparison.sequence),
         components=(None if row.repeats_causal else curves.components(comparison, row)) or UNSET,
     )
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def _over_seeds(group: Row) -> DrawnOverSeeds:

@@ -74,11 +74,6 @@ Found = TypeVar("Found")
 Record = TypeVar("Record", bound=Struct)
 
 
-def check_run_directory(target: Path) -> None:
-    """Raise OutputError unless a run directory can be written at ``target`` without the loss of anybody's files."""
-    check_replaceable(target, written_by_us)
-
-
 def written_by_us(directory: Path) -> frozenset[str]:
     """Return what in a directory an earlier run wrote: files by their relative path, folders with a slash behind.
 
@@ -134,7 +129,7 @@ def directories_for(cases: Sequence[Prepared], out: Path) -> tuple[Path, ...]:
     if len(names) > 1:
         check_parent(out)
     for directory in directories:
-        check_run_directory(directory)
+        check_replaceable(directory, written_by_us)
     return directories
 
 
