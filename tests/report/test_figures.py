@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
 from toolkit.report.curves import COLOURS, components, error_curves, look_numbers
-from toolkit.report.figures import FigureFormat, save
+from toolkit.report.figures import FigureFormat, save, style
 from toolkit.report.figures import comparison as drawing
 from toolkit.report.figures.comparison import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
+from toolkit.report.figures.trials import _label
 from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
 from toolkit.simulation import DRIVE, simulate
@@ -179,6 +181,16 @@ def test_a_figure_is_of_its_format_and_the_same_every_time(tmp_path, kind: Figur
     one, two = ((tmp_path / name / f"line.{kind}").read_bytes() for name in ("one", "two"))
     assert one.startswith(BEGINS[kind])
     assert one == two
+
+
+def test_a_legend_shows_whole_dashes_and_words_beside_points_cover_none() -> None:
+    for dashes in (one for ones in style._LINE_OF.values() for one in ones if not isinstance(one, str)):
+        assert sum(dashes[1]) * style._SAMPLE_PT <= style._SAMPLE_EM * style.LEGEND_PT
+    axes = new_figure(2.0).add_subplot()
+    _label(axes, [("default", (0.5, 0.5))] * 6)
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert len(boxes) == 4  # one on every side of the point
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
 def test_an_estimator_has_one_look_of_its_own_whatever_it_is_compared_with_and_one_colour() -> None:

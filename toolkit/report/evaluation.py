@@ -28,19 +28,20 @@ from toolkit.report.text import (
     WIDTH,
     ShownUnit,
     Table,
-    TextPart,
     Width,
     as_csv,
     as_latex,
+    as_markdown,
+    as_text,
     cell,
     filled,
     heading,
     in_html,
     in_markdown,
     listed,
+    markdown_section,
     number,
-    parts_as_markdown,
-    parts_as_text,
+    section,
     unit_of,
 )
 
@@ -55,6 +56,8 @@ _USUAL = (
 # Blocks of a stated covariance: in words, degrees of freedom, and the metric that is its energy score.
 _BLOCKS = {"pose": ("pose", 6, ""), "ori": ("orientation", 3, "energy_ori_deg"), "pos": ("position", 3, "energy_pos_m")}
 _UNCERTAINTY = "Stated uncertainty: means over the runs (95 % interval over the runs)"
+# A part of what is told: its title, and a table or lines.
+Part = tuple[str, Table | tuple[str, ...]]
 # What is told of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
@@ -243,26 +246,31 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         yield f"{listed(metric.key for metric in METRICS if metric.key in keys)}{whose}: {text}"
 
 
-def _parts(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> Iterator[TextPart]:
+def _parts(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> Iterator[Part]:
     """Yield what is told of an evaluation: tables, then what is more than chance, what failed and what to know."""
-    yield TextPart("Leaderboard", leaderboard_table(evaluation, columns))
+    yield "Leaderboard", leaderboard_table(evaluation, columns)
     if len(evaluation.sequences) > 1:
-        yield TextPart(f"{evaluation.ranked_by.name}, median over the runs", sequences_table(evaluation))
+        yield f"{evaluation.ranked_by.name}, median over the runs", sequences_table(evaluation)
     if (stated := uncertainty_table(evaluation)) is not None:
-        yield TextPart(_UNCERTAINTY, stated)
-    yield TextPart("Pairs", tuple(paired_lines(evaluation)))
-    yield TextPart("Fails", tuple(failure_lines(evaluation)))
-    yield TextPart("Notes", tuple(note_lines(evaluation)))
+        yield _UNCERTAINTY, stated
+    yield "Pairs", tuple(paired_lines(evaluation))
+    yield "Fails", tuple(failure_lines(evaluation))
+    yield "Notes", tuple(note_lines(evaluation))
 
 
 def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
-    lines = [filled(line, width) for line in header_lines(evaluation)]
-    return "\n".join([*lines, "", *parts_as_text(_parts(evaluation, columns), width)]).rstrip()
+    lines = [*(filled(line, width) for line in header_lines(evaluation)), ""]
+    for title, body in _parts(evaluation, columns):
+        lines += [title, "", as_text(body), ""] if isinstance(body, Table) else section(title.lower(), body, width)
+    return "\n".join(lines).rstrip()
 
 
 def evaluation_markdown(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
-    heads = (f"{in_markdown(line)}." for line in header_lines(evaluation))
-    return "\n\n".join([*heads, *parts_as_markdown(_parts(evaluation, columns))]) + "\n"
+    lines = [f"{in_markdown(line)}." for line in header_lines(evaluation)]
+    for title, body in _parts(evaluation, columns):
+        head = f"## {in_markdown(title)}"
+        lines += (head, as_markdown(body)) if isinstance(body, Table) else markdown_section(title, body)
+    return "\n\n".join(lines) + "\n"
 
 
 def evaluation_latex(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:

@@ -80,31 +80,6 @@ def markdown_section(title: str, entries: Iterable[str]) -> Iterator[str]:
         yield "\n".join(lines)
 
 
-class TextPart(NamedTuple):
-    """A part of a text: a table or lines, under a title."""
-
-    title: str
-    body: "Table | tuple[str, ...]"
-
-
-def parts_as_text(parts: Iterable[TextPart], width: Width) -> Iterator[str]:
-    """Yield the lines of parts: a table below its title, other lines beside it."""
-    for title, body in parts:
-        if isinstance(body, Table):
-            yield from (title, "", as_text(body), "")
-        else:
-            yield from section(title.lower(), body, width)
-
-
-def parts_as_markdown(parts: Iterable[TextPart]) -> Iterator[str]:
-    """Yield the paragraphs of parts; nothing of one without lines."""
-    for title, body in parts:
-        if isinstance(body, Table):
-            yield from (f"## {in_markdown(title)}", as_markdown(body))
-        else:
-            yield from markdown_section(title, body)
-
-
 def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
     for i, entry in enumerate(entries):
         label = f"{title}:" if i == 0 else ""
