@@ -32,6 +32,7 @@ from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.metrics import describe
 from toolkit.progress import silent
 from toolkit.registry import discover, find_all
+from toolkit.report import FigureChoice, FigureFormat
 from toolkit.report.comparison_table import comparison_latex, comparison_table
 from toolkit.report.explanation import EXPLANATIONS, ExplanationRecord
 from toolkit.report.headers import Columns, requested_columns
@@ -46,8 +47,6 @@ from toolkit.threads import MOST_WORKERS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-    from toolkit.report.figures import FigureChoice, FigureFormat
 
 Source = str | Path | Sequence
 Names = str | Iterable[str]
@@ -283,15 +282,11 @@ class Result:
         """Return :meth:`table` for a paper, after comments with recording and rules; it needs the package booktabs."""
         return comparison_latex(self.comparison, _checked_columns(columns))
 
-    def save(
-        self, directory: str | Path, figures: "FigureChoice" = "few", figure_format: "FigureFormat" = "png"
-    ) -> Path:
+    def save(self, directory: str | Path, figures: FigureChoice = "few", figure_format: FigureFormat = "png") -> Path:
         """Write the run directory that ``vislam compare`` writes, with "few", "all" or no ("none") figures.
 
         Raises OutputError where it cannot be written, SettingsError where there are no such figures.
         """
-        from toolkit.report.figures import FigureChoice, FigureFormat
-
         for what, value, known in (("figures", figures, FigureChoice), ("figure_format", figure_format, FigureFormat)):
             if value not in get_args(known):
                 raise SettingsError(f"{what} is {value!r}; there are {', '.join(get_args(known))}")

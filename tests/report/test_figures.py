@@ -15,9 +15,10 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
+from toolkit.report import FigureFormat
 from toolkit.report.curves import COLOURS, components, error_curves, look_numbers
-from toolkit.report.figures import FigureFormat, save, style
 from toolkit.report.figures import comparison as drawing
+from toolkit.report.figures import save, style
 from toolkit.report.figures.comparison import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.report.figures.trials import _label

@@ -9,9 +9,10 @@ from contextlib import suppress
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeVar, get_args
 
 from toolkit.errors import VislamError, did_you_mean, no_such, one_line
+from toolkit.report import FigureChoice, FigureFormat
 from toolkit.threads import MOST_WORKERS
 
 Number = TypeVar("Number", int, float)
@@ -261,8 +262,8 @@ COV_CONVENTION = arg(
 )
 FORMAT = choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text")
 FIGURES = (
-    choice("--figures", ("few", "all", "none"), "figures to draw (see docs/figures.md)", default="few"),
-    choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
+    choice("--figures", get_args(FigureChoice), "figures to draw (see docs/figures.md)", default="few"),
+    choice("--figure-format", get_args(FigureFormat), "format of the figures", default="png"),
 )
 REPAIR = Group(
     (

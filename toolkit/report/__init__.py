@@ -6,3 +6,9 @@ directories. curves has what is drawn; figures/ draws it, html/ makes the page o
 two, export passes one on. sweep and explanation have all that shows one. gate, evaluation and citations show the
 results of other commands.
 """
+
+from typing import Literal
+
+# Here, where the help of the command line finds them without what draws.
+FigureChoice = Literal["few", "all", "none"]
+FigureFormat = Literal["png", "pdf", "svg"]

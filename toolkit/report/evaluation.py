@@ -7,7 +7,6 @@ page.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,6 +21,7 @@ from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
 from toolkit.metrics.parts.consistency import nees_band
 from toolkit.metrics.uncertainty import REGIONS_PERCENT
+from toolkit.report import FigureChoice, FigureFormat
 from toolkit.report.html import card, filled_page, source
 from toolkit.report.text import (
     MISSING,
@@ -44,9 +44,6 @@ from toolkit.report.text import (
     section,
     unit_of,
 )
-
-if TYPE_CHECKING:
-    from toolkit.report.figures import FigureChoice, FigureFormat
 
 # Beside the metric that ranks, where there are values.
 _USUAL = (
@@ -299,7 +296,7 @@ def check_evaluation_directory(target: Path) -> None:
 
 
 def write_evaluation(
-    evaluation: EvaluatedSystems, target: Path, choice: "FigureChoice" = "few", kind: "FigureFormat" = "png"
+    evaluation: EvaluatedSystems, target: Path, choice: FigureChoice = "few", kind: FigureFormat = "png"
 ) -> None:
     """Write the directory, in the place of an earlier one, with figures of a kind as chosen.
 

@@ -30,6 +30,7 @@ from toolkit.files.reading import read_input
 from toolkit.files.writing import check_parent, check_replaceable, plain_name, replaced_directory, with_folders
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
+from toolkit.report import FigureChoice, FigureFormat
 from toolkit.report.comparison_table import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.html import card
@@ -62,7 +63,6 @@ _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
 _ERRORS = ("ate_none_m", "ate_se3_m", "ate_yaw_m", "heldout_reproj_rmse_px", "nees_pose_mean")
 
 if TYPE_CHECKING:
-    from toolkit.report.figures import FigureChoice, FigureFormat
     from toolkit.report.figures.style import NamedFigure
 
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
@@ -154,8 +154,8 @@ class MadeBy:
 
     command: str
     request: Request = field(default_factory=Request)
-    figures: "FigureFormat" = "png"
-    choice: "FigureChoice" = "few"
+    figures: FigureFormat = "png"
+    choice: FigureChoice = "few"
 
 
 def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:

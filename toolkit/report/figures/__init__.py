@@ -15,17 +15,16 @@ from matplotlib.axis import Axis
 from matplotlib.text import Text
 
 from toolkit.errors import printable
+from toolkit.report import FigureFormat
 from toolkit.report.figures.style import NamedFigure
 
 if TYPE_CHECKING:
     from toolkit.experiment.comparison import Comparison
 
-FigureFormat = Literal["png", "pdf", "svg"]
 # Text stays text in an SVG; in a PDF fonts are whole, as publishers ask (no Type 3).
 _IN_FILES: Any = {"svg.hashsalt": "vislam", "svg.fonttype": "none", "pdf.fonttype": 42}
 # Metadata with the time of drawing, by format; they are removed so that the same figure gives the same bytes.
 _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
-FigureChoice = Literal["few", "all", "none"]
 
 
 def drawn(comparison: "Comparison", choice: Literal["few", "all"] = "all") -> Iterator[NamedFigure]:
