@@ -307,6 +307,26 @@ SETTINGS = (
     arg("--window SECONDS", "length of the windows of estimators", positive_seconds, sets="window.lag_s"),
     arg("--set KEY=VALUE", "one setting (see 'vislam list settings'); may be repeated", action="append", default=[]),
 )
+# How recordings are prepared and estimators run, of every command that does so.
+HOW = (
+    *PART,
+    REPAIR,
+    choice("--start", ("measurements", "truth"), "source of the first state (default: measurements)", sets="start"),
+    TRACKS,
+    TOPICS,
+    arg("--seed N", "of simulated sequences (default: 0)", at_least(0), sets="first_seed"),
+    arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1), sets="seeds"),
+    choice("--vary", ("noise", "world"), "what a seed draws: noise, or the whole world (default: noise)", sets="vary"),
+    *SETTINGS,
+)
+SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
+TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
+OUT = arg(
+    "--out DIR",
+    "run directory (default: runs/<date and time>); runs of several seeds or variants are kept there as they end, and "
+    "the same command continues where it stopped",
+    Path,
+)
 
 
 def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any]) -> dict[str, Any]:

@@ -14,15 +14,12 @@ from toolkit.cli.arguments import (
     COV_CONVENTION,
     FIGURES,
     FORMAT,
-    PART,
-    REPAIR,
-    SETTINGS,
-    TOPICS,
-    TRACKS,
+    HOW,
+    OUT,
+    SCHEDULER,
+    TRUTH,
     WORKERS,
     arg,
-    at_least,
-    choice,
     command,
     estimators,
     flag,
@@ -42,28 +39,6 @@ if TYPE_CHECKING:
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
-
-
-# How recordings are prepared and estimators run, of every command that does so.
-HOW = (
-    *PART,
-    REPAIR,
-    choice("--start", ("measurements", "truth"), "source of the first state (default: measurements)", sets="start"),
-    TRACKS,
-    TOPICS,
-    arg("--seed N", "of simulated sequences (default: 0)", at_least(0), sets="first_seed"),
-    arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1), sets="seeds"),
-    choice("--vary", ("noise", "world"), "what a seed draws: noise, or the whole world (default: noise)", sets="vary"),
-    *SETTINGS,
-)
-SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
-TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
-OUT = arg(
-    "--out DIR",
-    "run directory (default: runs/<date and time>); runs of several seeds or variants are kept there as they end, and "
-    "the same command continues where it stopped",
-    Path,
-)
 
 
 class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error

@@ -8,7 +8,11 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
+    HOW,
+    OUT,
     PART,
+    SCHEDULER,
+    TRUTH,
     WORKERS,
     UsageError,
     arg,
@@ -19,7 +23,7 @@ from toolkit.cli.arguments import (
     output,
     seconds_from_start,
 )
-from toolkit.cli.compare import HOW, OUT, SCHEDULER, TRUTH, kept_where, new_run, requested, tell_unusable
+from toolkit.cli.compare import kept_where, new_run, requested, tell_unusable
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
