@@ -159,6 +159,7 @@ def panels_of(
     panels = dict(zip(names, grid, strict=False))
     for name, axes in panels.items():
         label_axes(axes, name, "", "")
+        axes.set_title(name, fontsize=TITLE_PT if columns < 4 else TICK_PT, loc="left")  # a remark is beside it
     # A panel with nothing below it has the numbers of the axis, too.
     for axes in grid[: len(names)][-columns:]:
         axes.tick_params(labelbottom=True)
