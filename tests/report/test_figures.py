@@ -172,6 +172,15 @@ def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Compari
     assert labels >= set(fourteen.estimators)
 
 
+def test_in_narrow_panels_a_name_and_the_shares_in_the_band_do_not_meet() -> None:
+    figure, panels = style.panels_of(list(discover()))
+    for axes in panels.values():
+        style.annotate(axes, "100, 99 %")
+    figure.draw_without_rendering()
+    for axes in panels.values():
+        assert not axes._left_title.get_window_extent().overlaps(axes._right_title.get_window_extent())
+
+
 @pytest.mark.parametrize("kind", BEGINS)
 def test_a_figure_is_of_its_format_and_the_same_every_time(tmp_path, kind: FigureFormat) -> None:
     for name in ("one", "two"):
