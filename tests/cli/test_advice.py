@@ -25,128 +25,64 @@ CHECK = "check --baseline b.json --trajectories"
 # What is typed, the advice, and what is typed then. Where the command would go on to run something the recording is one
 # that is not there, and that it says.
 ROWS = [
-    ("compare no --window 3 --set window.lag_s=2", "two values; leave one out", "compare no --window 3"),
-    ("check-data no --topics imu=/a,imu=/b", "imu is named twice; leave one out", "check-data no --topics imu=/a"),
-    ("compare no --config a.toml --config a.toml", "it takes one file", "compare no --config a.toml"),
-    (
-        "compare no --estimators ekf batch",
-        "give names with commas: --estimators ekf,batch",
-        "compare no --estimators ekf,batch",
-    ),
-    ("compare no --estimtors ekf", "did you mean --estimators?", "compare no --estimators ekf"),
-    ("compare no --trajectory truth=a.tum", "choose another", "compare no --trajectory theirs=truths/A.tum"),
-    (f"compare no --trajectory {NAME}=a.tum", "shorten it", "compare no --trajectory theirs=truths/A.tum"),
-    (
-        "compare no --config other.json",
-        "name the manifest.json of a comparison, or a TOML file",
-        "compare no --config a.toml",
-    ),
-    (
-        "simulate flight --out d --duration 0.1 --lens radtan",
-        "add --images",
-        "simulate flight --out d --duration 0.1 --lens radtan --images",
-    ),
-    (
-        "sweep --over window.lag_s=1,2",
-        "name the sequence to sweep, a path or a built-in name as drive",
-        "sweep no --over window.lag_s=1,2",
-    ),
-    ("sweep no", "name a setting or a fault and its values", "sweep no --over window.lag_s=1,2"),
-    (
-        "sweep no --over window.lag_s=1 --over window.lag_s=2",
-        "give all its values at once",
-        "sweep no --over window.lag_s=1,2",
-    ),
-    (
-        "sweep no --over window.lag_s=1 --over noise.motion_scale=2 --over noise.pixel_sigma_px=2",
-        "cross two, or sweep each by itself",
-        "sweep no --over window.lag_s=1 --over noise.motion_scale=2",
-    ),
-    (
-        "sweep no --over fault:outlier_tracks=many",
-        "is no dose; give numbers, in",
-        "sweep no --over fault:outlier_tracks=0.1",
-    ),
-    ("export run --format tum", "give --format and --out for a trajectory", "export run --format tum --out a.tum"),
-    ("report nowhere", "give a run directory, as vislam compare writes it", "report run"),
-    (
-        "export run --format kitti --cov-convention rot-pos/right --out x",
-        "has no place for covariances; choose another format",
-        "export run --format tum --cov-convention rot-pos/right --out x",
-    ),
-    (
-        "export run --estimator truth --format tum --cov-convention rot-pos/right --out x",
-        "leave out --cov-convention",
-        "export run --estimator truth --format tum --out x",
-    ),
-    ("evaluate truths/A.tum nowhere.tum", "no such file; check the path", "evaluate truths/A.tum results/ours/A/1.tum"),
-    (
-        "evaluate nowhere results/ours/A/1.tum",
-        "give a file, or a folder that has SEQUENCE.tum",
-        "evaluate truths results",
-    ),
-    (
-        "evaluate truths/A.tum results/ours/A",
-        "a folder of one system's runs needs its name, NAME=results/ours/A",
-        "evaluate truths/A.tum ours=results/ours/A",
-    ),
-    ("evaluate truths/A.tum results/ours/A", "or give a folder of truths", "evaluate truths results"),
-    (
-        "evaluate truths results/ours/A/1.tum",
-        "where the truth is a folder, give systems as NAME=FOLDER",
-        "evaluate truths ours=results/ours",
-    ),
-    ("evaluate two results", "it has 2 truths for A; leave one, A.tum", "evaluate truths results"),
-    (
-        "evaluate truths ours=both",
-        "A is given twice, as A.csv and A.tum; keep one",
-        "evaluate truths ours=results/ours",
-    ),
-    (
-        "evaluate truths results ours=results/ours",
-        "ours is given twice; give each system another name",
-        "evaluate truths results theirs=results/ours",
-    ),
-    (
-        "evaluate truths ours=a.toml",
-        "where the truth is a folder, give systems as NAME=FOLDER",
-        "evaluate truths ours=results/ours",
-    ),
-    (
-        "baseline --trajectories a.toml --truth truths --out b.json",
-        "it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum",
-        f"{BASELINE} b.json",
-    ),
-    ("baseline --out b.json", "name a SEQUENCE, or --trajectories DIR", f"{BASELINE} b.json"),
-    (
-        "baseline --trajectories results/ours --out b.json",
-        "name it with --truth A=FILE.tum or --truth DIR",
-        "baseline --trajectories results/ours --truth A=truths/A.tum --out b.json",
-    ),
-    (f"{BASELINE} c.json --truth two", "--truth names two folders, truths and two; give one", f"{BASELINE} c.json"),
-    (f"{CHECK} results/ours --truth A=absent.tum", "check the path", f"{CHECK} results/ours"),
-    (f"{CHECK} results/ours --truth A=other.tum", "make a new baseline", f"{BASELINE} c.json"),
-    ("check --baseline b.json", "check it with --trajectories DIR", f"{CHECK} results/ours"),
-    (
-        f"{CHECK} results/ours --json c.json --markdown c.json",
-        "are files of their own; give each its name",
-        f"{CHECK} results/ours --json c.json --markdown c.md",
-    ),
-    (
-        f"evaluate truths ours=results/ours --max-dt 0.1 --out e && {EVALUATED}",
-        "evaluate again without --max-dt",
-        f"evaluate truths ours=results/ours --out e && {EVALUATED}",
-    ),
-    (
-        f"evaluate truths ours=results/ours --gap 9 --out e && {EVALUATED}",
-        "evaluate again with --gap 5",
-        f"evaluate truths ours=results/ours --gap 5 --out e && {EVALUATED}",
-    ),
-    (
-        "baseline --plan --trajectories truths --truth truths",
-        "give the files of repeated runs, SEQUENCE/RUN.tum",
-        "baseline --plan --trajectories results/ours --truth truths",
-    ),
+    tuple(part.strip() for part in row.split(" | "))
+    for row in f"""
+compare no --window 3 --set window.lag_s=2 | two values; leave one out | compare no --window 3
+check-data no --topics imu=/a,imu=/b | imu is named twice; leave one out | check-data no --topics imu=/a
+compare no --config a.toml --config a.toml | it takes one file | compare no --config a.toml
+compare no --estimators ekf batch | give names with commas: --estimators ekf,batch | compare no --estimators ekf,batch
+compare no --estimtors ekf | did you mean --estimators? | compare no --estimators ekf
+compare no --trajectory truth=a.tum | choose another | compare no --trajectory theirs=truths/A.tum
+compare no --trajectory {NAME}=a.tum | shorten it | compare no --trajectory theirs=truths/A.tum
+compare no --config other.json | name the manifest.json of a comparison, or a TOML file | compare no --config a.toml
+simulate flight --out d --duration 0.1 --lens radtan | add --images \
+    | simulate flight --out d --duration 0.1 --lens radtan --images
+sweep --over window.lag_s=1,2 | name the sequence to sweep, a path or a built-in name as drive \
+    | sweep no --over window.lag_s=1,2
+sweep no | name a setting or a fault and its values | sweep no --over window.lag_s=1,2
+sweep no --over window.lag_s=1 --over window.lag_s=2 | give all its values at once | sweep no --over window.lag_s=1,2
+sweep no --over window.lag_s=1 --over noise.motion_scale=2 --over noise.pixel_sigma_px=2 \
+    | cross two, or sweep each by itself \
+    | sweep no --over window.lag_s=1 --over noise.motion_scale=2
+sweep no --over fault:outlier_tracks=many | is no dose; give numbers, in | sweep no --over fault:outlier_tracks=0.1
+export run --format tum | give --format and --out for a trajectory | export run --format tum --out a.tum
+report nowhere | give a run directory, as vislam compare writes it | report run
+export run --format kitti --cov-convention rot-pos/right --out x | has no place for covariances; choose another format \
+    | export run --format tum --cov-convention rot-pos/right --out x
+export run --estimator truth --format tum --cov-convention rot-pos/right --out x | leave out --cov-convention \
+    | export run --estimator truth --format tum --out x
+evaluate truths/A.tum nowhere.tum | no such file; check the path | evaluate truths/A.tum results/ours/A/1.tum
+evaluate nowhere results/ours/A/1.tum | give a file, or a folder that has SEQUENCE.tum | evaluate truths results
+evaluate truths/A.tum results/ours/A | a folder of one system's runs needs its name, NAME=results/ours/A \
+    | evaluate truths/A.tum ours=results/ours/A
+evaluate truths/A.tum results/ours/A | or give a folder of truths | evaluate truths results
+evaluate truths results/ours/A/1.tum | where the truth is a folder, give systems as NAME=FOLDER \
+    | evaluate truths ours=results/ours
+evaluate two results | it has 2 truths for A; leave one, A.tum | evaluate truths results
+evaluate truths ours=both | A is given twice, as A.csv and A.tum; keep one | evaluate truths ours=results/ours
+evaluate truths results ours=results/ours | ours is given twice; give each system another name \
+    | evaluate truths results theirs=results/ours
+evaluate truths ours=a.toml | where the truth is a folder, give systems as NAME=FOLDER \
+    | evaluate truths ours=results/ours
+baseline --trajectories a.toml --truth truths --out b.json \
+    | it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum \
+    | {BASELINE} b.json
+baseline --out b.json | name a SEQUENCE, or --trajectories DIR | {BASELINE} b.json
+baseline --trajectories results/ours --out b.json | name it with --truth A=FILE.tum or --truth DIR \
+    | baseline --trajectories results/ours --truth A=truths/A.tum --out b.json
+{BASELINE} c.json --truth two | --truth names two folders, truths and two; give one | {BASELINE} c.json
+{CHECK} results/ours --truth A=absent.tum | check the path | {CHECK} results/ours
+{CHECK} results/ours --truth A=other.tum | make a new baseline | {BASELINE} c.json
+check --baseline b.json | check it with --trajectories DIR | {CHECK} results/ours
+{CHECK} results/ours --json c.json --markdown c.json | are files of their own; give each its name \
+    | {CHECK} results/ours --json c.json --markdown c.md
+evaluate truths ours=results/ours --max-dt 0.1 --out e && {EVALUATED} | evaluate again without --max-dt \
+    | evaluate truths ours=results/ours --out e && {EVALUATED}
+evaluate truths ours=results/ours --gap 9 --out e && {EVALUATED} | evaluate again with --gap 5 \
+    | evaluate truths ours=results/ours --gap 5 --out e && {EVALUATED}
+baseline --plan --trajectories truths --truth truths | give the files of repeated runs, SEQUENCE/RUN.tum \
+    | baseline --plan --trajectories results/ours --truth truths
+""".strip().splitlines()
 ]
 
 
