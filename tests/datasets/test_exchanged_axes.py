@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.datasets.trajectories import PosesFile, tum
 from toolkit.datasets.trajectories.belonging import Exchange, Reference, body_of, exchanges
-from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
 from toolkit.geometry import Array, about_z, se3, se3_inverse, so3_exp
 from toolkit.simulation import SCENARIOS, simulate
@@ -30,7 +30,7 @@ def told(truth: Array, estimate: Array) -> str:
     """Return what is said of poses (n, 4, 4) beside a truth (n, 4, 4) of the same times."""
     t_ns = 100_000_000 * np.arange(len(truth))
     try:
-        file = PosesFile(Path("s.tum"), "TUM", t_ns, estimate, None)
+        file = PosesFile(Path("s.tum"), "TUM", t_ns, estimate, tum.other_order)
         body_of(file, Reference.of_truth("made", t_ns, truth), t_ns, (truth, estimate))
     except DataError as error:
         return str(error)
@@ -58,6 +58,16 @@ def test_sound_poses_of_any_body_and_world_are_not_accused(scenario: str, durati
     assert told(truth, estimate) == ""
     assert told(truth, estimate @ T_BODY_CAM) == ""
     assert told(truth, se3(np.tile(np.eye(3), (len(truth), 1, 1)), estimate[:, :3, 3])) == ""
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_body_with_other_axes_is_not_said_to_be_misread_where_it_hardly_turns(axis: int) -> None:
+    """Swings of some degrees of a body that is mounted as EuRoC's IMU: read w first, they resemble the truth's."""
+    t_s = 0.1 * np.arange(200)[:, None]
+    swings = 0.1 * np.sin(t_s) * np.eye(3)[axis] + 0.015 * np.sin([1.3, 0.7, 1.7] * t_s + [0.0, 1.0, 1.6])
+    R_world_imu = so3_exp(swings) @ so3_exp(np.array([0.0, -np.pi / 2.0, 0.0]))
+    truth = se3(R_world_imu, np.sin([0.5, 0.3, 0.8] * t_s + [0.0, 1.6, 0.0]))
+    assert told(truth, truth @ T_BODY_CAM) == ""
 
 
 def test_positions_that_are_mirrored_beside_no_orientations_are_reported_to_be() -> None:

@@ -41,6 +41,8 @@ from toolkit.sequence import Sequence
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,
 # unexplained than under the file's own: slow turns correlate with unrelated ones by chance, 0.8 at times.
 _FITTING_CORRELATION, _UNEXPLAINED_SHARE = 0.5, 1.0 / 3.0
+# A body with other axes has three angles that are fitted: a reading, which has none, may leave a little more.
+_FITTED_MORE = 1.25
 # Rates that follow the gyro this closely are read rightly, and no other reading is tried.
 _SURE_CORRELATION = 0.95
 # Three angles are fitted to say that a body has other axes, and mounts are off by some degrees: more is asked for.
@@ -71,6 +73,7 @@ _ALONG_AN_AXIS = 0.9
 _STEADY, _STILL = 0.95, 1e-9
 # A turn of a body that is told, and is no other axes: an extrinsic that is a little off.
 _LEAST_TOLD_RAD = float(np.deg2rad(2.0))
+_ROUNDED_RAD = 1e-6
 _NAMES = "xyz"
 Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 
@@ -279,20 +282,22 @@ def check_turns(
 ) -> bool:
     """Return whether rotations (N, 3, 3) agree with the gyro; False also where the recording is too short or straight.
 
-    Raises DataError where they agree under one of the readings, and not as given: misread rotations turn the other way
-    and about other axes.
+    Raises DataError where they agree under one of the readings, and neither as given nor with other axes of the body:
+    misread rotations turn the other way and about other axes.
     """
     within = stamps_among(t_ns, reference.rates_t_ns)
     steps, given = Steps.of(t_ns[within]), R_world_imu[within]
     if steps.start.size < 2:
         return False
-    measured = steps.mean_rates(reference)
-    as_given = _correlation(steps.rates(given), measured)
+    measured, rates = steps.mean_rates(reference), steps.rates(given)
+    as_given = _correlation(rates, measured)
     if as_given > _SURE_CORRELATION:
         return True
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
-    if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):
+    turned = _correlation(rates @ _turn_between(rates, measured).T, measured)
+    least = 1.0 - min(_UNEXPLAINED_SHARE * (1.0 - as_given), _FITTED_MORE * (1.0 - turned))
+    if fit > max(_FITTING_CORRELATION, least):
         raise _only_if(what, reference, best)
     return as_given > _FITTING_CORRELATION and as_given >= fit
 
@@ -307,12 +312,16 @@ def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> A
     steps = Steps.of(t_ns[within])
     if steps.start.size < _FEWEST_STEPS:
         return None
-    both = steps.mean_rates(reference), steps.rates(R_world_body[within])
-    measured, rates = (x - x.mean(axis=0) for x in both)
-    turn, _ = nearest_rotation(measured.T @ rates)
+    measured, rates = steps.mean_rates(reference), steps.rates(R_world_body[within])
+    turn = _turn_between(rates, measured)
     as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
     is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
     return turn if is_other and so3_angle(turn) > _OTHER_AXES_RAD else None
+
+
+def _turn_between(one: Array, other: Array) -> Array:
+    """Return the turn (3, 3) that takes a series (N, 3) nearest to another about their means (Kabsch 1976)."""
+    return nearest_rotation((other - other.mean(axis=0)).T @ (one - one.mean(axis=0)))[0]
 
 
 def stamps_among(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
@@ -382,8 +391,8 @@ def _body(
             return given
         # A reading that leaves no turn is likelier than one that leaves a turn, which a loop may make by chance.
         best = min(left, key=lambda one: left[one].scatter_rad)
-        is_better = not left[best].is_other_body if fits else left[best].scatter_rad < given.scatter_rad / _TIMES
-        if is_better and left[best].scatter_rad < most_rad:
+        least_rad = given.scatter_rad * (_FITTED_MORE if fits else 1.0 / _TIMES) + _ROUNDED_RAD
+        if not (fits and left[best].is_other_body) and left[best].scatter_rad < min(most_rad, least_rad):
             raise _only_if(what, reference, best)
         if fits:
             return given

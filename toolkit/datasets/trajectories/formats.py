@@ -51,15 +51,16 @@ from toolkit.measurements import NS_PER_S
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
 _UNIT_TOLERANCE = 1e-2
 _TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
-# A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
-_IDENTITY_TOLERANCE = 1e-2
+# A file whose first four-vector is this close to (1, 0, 0, 0), as printed, starts at the identity if it is w first.
+_IDENTITY_TOLERANCE = 1e-3
 # Share of the rows that have the stamp of the one before, from which on stamps have too few digits.
 _MOST_OF_ONE_STAMP = 0.2
 INVERT_EACH = "the poses look like those of the world in the IMU frame: invert each one"
 CONJUGATE = "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them"
 # Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
-# Flights of 2 s reach 0.95 in the wrong order; drives of 20 s have 0.995 or more in their own.
-_VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.97, 0.1
+# Of what it lacks in the world, a vehicle of 20 s lacks less than this share in its own frame, and not one in 10,000
+# windows of 1 s and more in another reading; flights of 2 s reach 0.2 in the wrong order.
+_VEHICLE_CONCENTRATION, _LEAST_GAIN, _UNEXPLAINED_BENDS = 0.97, 0.1, 0.1
 
 
 # The lines of a file as cells ----------------------------------------------------------------------------------------
@@ -224,26 +225,30 @@ class PosesFile:
     def check_order(self) -> None:
         """Raise DataError where the trajectory alone shows that its quaternions are in the other order, or inverted.
 
-        A vehicle moves in one direction of its own frame. If that holds in the other order and not as given, the order
-        is wrong; where both readings do as well (no turn, or a hand-held camera), a start at the identity decides:
-        read in the wrong order it is a start upside down.
+        A vehicle moves in one direction of its own frame, however its path bends. If that holds in another reading and
+        not as given, the file is misread. Where no reading explains the bends (there are none, or the camera is
+        hand-held), a start at the identity decides: read in the wrong order it is a start upside down.
         """
         other, positions, R_world_imu = self.other_order, self.T_world_imu[:, :3, 3], self.T_world_imu[:, :3, :3]
         if other is None:
             return
-        reread = other.reread(R_world_imu)
-        as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
-        R_imu_world = transposed(R_world_imu)
-        inverted_positions = -np.einsum("nij,nj->ni", R_imu_world, positions)
-        readings = ((INVERT_EACH, inverted_positions), (CONJUGATE, positions))
-        inverted, remedy = max((_concentration(at, R_imu_world), remedy) for remedy, at in readings)
-        is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
-        # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is
-        # named.
-        if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
-            raise DataError(f"{self.path}: {remedy}")
+        R_imu_world, reread = transposed(R_world_imu), other.reread(R_world_imu)
+        given = _travel(positions, R_world_imu)
+        inverted = _travel(-np.einsum("nij,nj->ni", R_imu_world, positions), R_imu_world)
+        otherwise = _travel(positions, reread)
+        readings = {CONJUGATE: _travel(positions, R_imu_world), other.remedy: otherwise}
+        # Far from its origin a path turns into a long swing about it, which bends by its own turns.
+        if inverted.path_m <= given.path_m:
+            readings = {INVERT_EACH: inverted, **readings}
+        fitting = {remedy: one.ahead for remedy, one in readings.items() if one.explains_its_bends}
+        better = {remedy: ahead for remedy, ahead in fitting.items() if ahead > given.ahead + _LEAST_GAIN}
+        if better:
+            # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is
+            # named.
+            likely = max(better, key=lambda remedy: better[remedy] - _LEAST_GAIN * (remedy == other.remedy))
+            raise DataError(f"{self.path}: {likely}")
         starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
-        if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
+        if starts_at_identity and otherwise.ahead >= given.ahead - _LEAST_GAIN and not given.explains_its_bends:
             raise DataError(f"{self.path}: {other.remedy}")
 
 
@@ -631,9 +636,27 @@ def _rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: 
     return "\n".join([*([header] if header else []), *lines]) + "\n"
 
 
-def _concentration(positions: Array, R_world_imu: Array) -> float:
-    """Return the mean resultant length, 0 to 1, of the body-frame displacements: 1 where all point the same way."""
+class _Travel(NamedTuple):
+    """How long a path (m) is, and the mean resultant lengths, 0 to 1, of its steps in the body and in the world.
+
+    A length is 1 where all steps point the same way, so that ``ahead`` is that of a vehicle, ``straight`` of a line.
+    """
+
+    path_m: float
+    ahead: float
+    straight: float
+
+    @property
+    def explains_its_bends(self) -> bool:
+        """Say whether the steps have one direction in the body, and by far not in the world."""
+        unexplained = _UNEXPLAINED_BENDS * (1.0 - self.straight)
+        return self.ahead > _VEHICLE_CONCENTRATION and 1.0 - self.ahead < unexplained
+
+
+def _travel(positions: Array, R_world_imu: Array) -> _Travel:
+    """Return how positions (N, 3) move along the axes of bodies (N, 3, 3)."""
     steps = np.diff(positions, axis=0)
-    total = np.linalg.norm(steps, axis=1).sum()
+    path_m = float(np.linalg.norm(steps, axis=1).sum())
     in_body = np.einsum("nji,nj->ni", R_world_imu[:-1], steps)
-    return float(np.linalg.norm(in_body.sum(axis=0)) / total) if total > 0.0 else 0.0
+    ahead, straight = (float(np.linalg.norm(x.sum(axis=0)) / (path_m or 1.0)) for x in (in_body, steps))
+    return _Travel(path_m, ahead, straight)
