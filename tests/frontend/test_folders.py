@@ -196,6 +196,15 @@ def test_a_truth_that_turns_otherwise_than_the_gyro_is_reported(asl: Path) -> No
     assert stranger()
 
 
+def test_a_truth_too_slow_to_be_interpolated_is_kept_at_its_own_stamps(asl: Path) -> None:
+    lines = (asl / "truth.tum").read_text().splitlines(keepends=True)[::3]
+    (asl / "truth.tum").write_text("".join(lines))
+    truth = load_sequence(str(asl)).truth
+    assert truth is not None
+    stamps_s = [float(line.split()[0]) for line in lines]
+    np.testing.assert_allclose(truth.t_ns / 1e9, stamps_s, rtol=0.0, atol=2.4e-7)  # as doubles they are so far apart
+
+
 def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
     for camera in (0, 1):
         for path in reversed(images(asl, camera)):

@@ -30,7 +30,7 @@ from toolkit.datasets.io.image_pairs import (
     seen_in,
 )
 from toolkit.datasets.io.tables import columns_of_file, headings_of, read_stamps
-from toolkit.datasets.io.truth import find_truth, stamps_within, truth_at, truth_near
+from toolkit.datasets.io.truth import find_truth, seconds_apart, stamps_within, truth_at, truth_near
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
@@ -160,6 +160,11 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         raise DataError(": ".join((f"{layout.root}: no ground truth in {where}, {why}", *few_images)))
     stamps = read_stamps(layout.stamps)
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
+    apart_s = seconds_apart(choice.truth)
+    if apart_s and frames_t_ns.size < 2:
+        slow = f"the truth has a pose every {apart_s:.3g} s"
+        why = "where there are no images the tracks are simulated along it"
+        raise DataError(f"{layout.root}: {slow}, and {why}; give a truth of 10 Hz or more")
     check_frame_count(layout.root, frames_t_ns.size)
     truth = truth_at(choice.truth, frames_t_ns)
     points = _room_around(layout.root, truth.T_world_imu[:, :3, 3])

@@ -110,8 +110,15 @@ def stamps_within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) ->
     return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= _LONGEST_TRUTH_GAP_NS])
 
 
+def seconds_apart(truth: Truth) -> float:
+    """Return the median step of a truth where its poses are too far apart to be interpolated, or else 0."""
+    step_ns = float(np.median(np.diff(truth.t_ns))) if truth.t_ns.size > 1 else 0.0
+    return step_ns / NS_PER_S if step_ns > _LONGEST_TRUTH_GAP_NS else 0.0
+
+
 def truth_near(truth: Truth, t_ns: IntArray) -> Truth:
-    return truth_at(truth, stamps_within(t_ns, truth.t_ns, truth.t_ns))
+    """Return the truth at those of the stamps (K,) that it reaches; at its own where its poses are too far apart."""
+    return truth if seconds_apart(truth) else truth_at(truth, stamps_within(t_ns, truth.t_ns, truth.t_ns))
 
 
 def truth_at(truth: Truth, t_ns: IntArray) -> Truth:
