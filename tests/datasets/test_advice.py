@@ -847,6 +847,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             lines("truth.tum", lambda all_: [f"{float(line[:20]) - 500.0:.9f}{line[20:]}" for line in all_]),
             "check that both are of one recording and clock",
         ),
+        (
+            both(lines("truth.tum", lambda all_: all_[::3]), check("--tracks", "simulated")),
+            "the truth has a pose every 0.15 s, and where there are no images the tracks are simulated along it; "
+            "give a truth of 10 Hz or more",
+        ),
         (both(*(lines(name, restamped(lambda t: t // 1000)) for name in TABLES)), "microseconds: multiply by 1e3"),
         (lines(TABLES[0], of_rows(in_seconds)), "write seconds times 1e9"),
         (lines(TABLES[1], restamped(lambda t: t + 20_000_000)), "clocks differ, correct the stamps of cam1"),

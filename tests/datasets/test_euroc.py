@@ -175,13 +175,6 @@ def test_no_frame_lies_in_a_gap_of_the_truth(recording: Path) -> None:
     assert ((t_s < 0.99).sum(), (t_s > 1.5).sum()) == (10, 20)
 
 
-def test_the_cause_is_said_where_a_truth_is_too_slow_to_simulate_tracks_along_it(recording: Path) -> None:
-    truth_s = np.arange(0.5, 2.5, 0.25)
-    write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
-    with pytest.raises(DataError, match=r"the truth has a pose every 0.25 s, .* simulated .*; give a truth of 10 Hz"):
-        load_sequence(str(recording))
-
-
 def test_of_two_truths_the_one_that_turns_as_the_gyro_says_is_used(recording: Path) -> None:
     truth_s = np.arange(0.5, 2.5, 0.005)
     good, turned = orientations(truth_s), orientations(truth_s) @ TURNED
