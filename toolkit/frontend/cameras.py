@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, so3_angle
+from toolkit.geometry import Array, BoolArray, se3_inverse, so3_angle
 from toolkit.measurements import StereoRig
 
 Image = npt.NDArray[np.uint8]
@@ -20,6 +20,8 @@ Pinhole = tuple[float, float, float, float]
 Distortion = Literal["none", "radtan", "equidistant"]
 # A rectified pair sees nearly what its cameras see; cameras that look apart by more are no stereo pair.
 _MOST_TURNED_RAD = 0.5
+# No two cameras are so near each other.
+_SAME_PLACE_M = 1e-6
 # Bilinear interpolation at the border of what a camera sees mixes in what it does not see.
 _BORDER_PX = 3
 
@@ -131,17 +133,27 @@ def _check_pair(left: Camera, right: Camera, T_right_left: Array, where: str) ->
             f"{where}: the cameras look {np.rad2deg(turned):.0f} deg apart, and a stereo pair looks the same way; "
             "correct the extrinsics, or name two cameras that are a pair"
         )
-    x, y, z = T_right_left[:3, 3]
-    if not np.any(T_right_left[:3, 3]):
+    check_beside(T_right_left, where)
+
+
+def check_beside(T_right_left: Array, where: str, if_inverted: Array | None = None) -> None:
+    """Raise DataError unless the right camera stands to the right of the left one, as for :func:`rectified`.
+
+    ``if_inverted`` (4, 4) is where it would be if the pose of each were the inverse of what it is called.
+    """
+    x, y, z = se3_inverse(T_right_left)[:3, 3] + 0.0  # and no -0
+    aside = max(abs(y), abs(z))
+    if max(abs(x), aside) < _SAME_PLACE_M:
         raise DataError(
             f"{where}: both cameras stand in the same place, so there is no baseline; correct the extrinsics, or "
             "name two cameras"
         )
-    if -x < max(abs(y), abs(z)):
-        side = "left" if x > max(abs(y), abs(z)) else "above, below or behind"
-        raise DataError(
-            f"{where}: the right camera stands {side} of the left one; exchange them, or correct the extrinsics"
-        )
+    if x >= aside:
+        return
+    side, remedy = ("left" if -x > aside else "above, below or behind"), "exchange them, or correct the extrinsics"
+    if -x <= aside and if_inverted is not None and if_inverted[0, 3] > np.abs(if_inverted[1:3, 3]).max():
+        remedy = "each T_BS looks like the inverse of one: invert both"
+    raise DataError(f"{where}: the right camera stands {side} of the left one, at {x:.3g} {y:.3g} {z:.3g} m; {remedy}")
 
 
 def _maps(camera: Camera, R_rect_cam: Array, K: Array) -> Maps:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from toolkit.datasets.io.fields import Fields, read_fields, rigid
 from toolkit.errors import DataError, printable
-from toolkit.files.reading import is_regular, open_input
-from toolkit.frontend.cameras import Camera, Distortion, Pinhole
+from toolkit.files.reading import is_regular
+from toolkit.frontend.cameras import Camera, Distortion, Pinhole, check_beside
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.models.noise import mems_imu
@@ -49,8 +49,6 @@ _T_IMU_CAM0 = np.array(
 _CAM1_IN_IMU_M = np.array([-0.0198435579556, 0.0453689425024, 0.00786212447038])
 _PINHOLE_PX = (458.654, 457.296, 367.215, 248.375)
 _SIZE_PX = (752, 480)
-# No two cameras are so near each other.
-_SAME_PLACE_M = 1e-6
 _STATED_NOISE = ImuNoise(
     accel_noise_density=2e-3, gyro_noise_density=1.6968e-4, accel_random_walk=3e-3, gyro_random_walk=1.9393e-5
 )
@@ -68,14 +66,8 @@ _USED = {
     *("distortion_coeffs", "intrinsics", "resolution", _SHIFT, *_DENSITIES.values()),
 }
 _OF_NO_EFFECT = {"rostopic", "cam_overlaps", "comment", "sensor_type", "rate_hz", "update_rate", "model"}
-# Whose calibration a file is that is not read, by names in it, and how much of it is looked at; files that are named.
-_SYSTEMS = {
-    "Basalt": (b'"T_imu_cam"', b'"value0"'),
-    "VINS": (b"body_T_cam0", b"cam0_calib"),
-    "ORB-SLAM3": (b"Camera1.fx", b"Camera.fx", b"ORBextractor"),
-    "OpenVINS": (b"relative_config_imucam",),
-}
-_LOOKED_AT, _NAMED, _KINDS = 1 << 16, 3, ("*.yaml", "*.yml", "*.json")
+# Files that are named where none of them is read.
+_NAMED, _KINDS = 3, ("*.yaml", "*.yml", "*.json")
 _COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs")
 
 
@@ -139,7 +131,7 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
     stated, unused = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
-    _check_right(right.path, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
+    check_beside(se3_inverse(T_left_right), str(right.path), extrinsic(left) @ se3_inverse(extrinsic(right)))
     noise = (stated, AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
     found = _calibration(left, right, (T_imu_left, T_left_right), noise, "the folder's sensor.yaml files")
     return replace(found, unused=(*_unused(left), *_unused(right), *unused))
@@ -148,17 +140,11 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
 def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
     missing = ", ".join(str(file.relative_to(mav0)) for file in lacking)
     there = [file for folder in (mav0.parent, mav0) for kind in _KINDS for file in folder.glob(kind)]
-    others = [f"{printable(file.name)}{_of_system(file)} is not read" for file in sorted(set(there))[:_NAMED]]
+    others = [f"{printable(file.name)} is not read" for file in sorted(set(there))[:_NAMED]]
     return (
         f"{mav0}: missing {missing}, and there is no *camchain*.yaml of Kalibr's that states it{'; ' if others else ''}"
         f"{', '.join(others)}; write the calibration as docs/images.md describes"
     )
-
-
-def _of_system(file: Path) -> str:
-    with open_input(file) as opened:
-        content = opened.read(_LOOKED_AT)
-    return next((f" of {system}" for system, names in _SYSTEMS.items() if any(n in content for n in names)), "")
 
 
 def _unused(sensor: Fields, name: str = "") -> Iterator[str]:
@@ -210,7 +196,7 @@ def _of_kalibr(camchain: Path, root: Path, mav0: Path) -> AslCalibration:
     stated = kalibr_noise(camchain.parent, root, mav0) or (is_regular(sensor) and _stated_noise(read_fields(sensor)))
     noise, unused = stated or (mems_imu(), ())
     T_left_right = se3_inverse(T_right_left)
-    _check_right(camchain, T_left_right, None)
+    check_beside(T_right_left, str(camchain))
     how = (noise, AS_STATED if stated else NO_NOISE)
     found = _calibration(left, right, (T_imu_left, T_left_right), how, str(camchain.relative_to(root)))
     return replace(found, unused=(*_unused(left, "cam0"), *_unused(right, "cam1"), *unused))
@@ -231,23 +217,6 @@ def _stated_noise(fields: Fields) -> tuple[ImuNoise, tuple[str, ...]]:
     imu = _part(fields, name) if name else fields
     imu.require(*_DENSITIES.values())
     return ImuNoise(**{ours: imu.positive(theirs) for ours, theirs in _DENSITIES.items()}), tuple(_unused(imu, name))
-
-
-def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> None:
-    """Raise DataError where cam1 is not to the right of cam0.
-
-    ``inverted`` (4, 4) is where it would be if each extrinsic were the inverse of what it is called.
-    """
-    if T_left_right[0, 3] > 0.0:
-        return
-    x, y, z = T_left_right[:3, 3]
-    if max(abs(x), abs(y), abs(z)) < _SAME_PLACE_M:
-        raise DataError(f"{path}: cam0 and cam1 stand at one place, so there is no baseline; give each its own pose")
-    if -x < max(abs(y), abs(z)):
-        turned = inverted is not None and inverted[0, 3] > np.abs(inverted[1:3, 3]).max()
-        remedy = "each T_BS looks like the inverse of one: invert both" if turned else "correct the pose of one of them"
-        raise DataError(f"{path}: cam1 is at {x:.3g} {y:.3g} {z:.3g} m of cam0, not to the right of it; {remedy}")
-    raise DataError(f"{path}: cam1 is not to the right of cam0; exchange the two")
 
 
 def _calibration(
