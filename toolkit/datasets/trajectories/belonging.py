@@ -277,46 +277,42 @@ def turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
     return np.stack([np.interp(at_s, sample_s, axis) for axis in reached.T], axis=1)
 
 
+class Turns(NamedTuple):
+    """Whether rates of rotation agree with the gyro's, and the turn R_reference_body (3, 3) of a body with other axes.
+
+    It is found where they agree once they are turned as a whole (the best turn: Kabsch 1976), and not as they are; a
+    camera's poses beside an IMU's are the usual case.
+    """
+
+    confirmed: bool
+    R_reference_body: Array | None = None
+
+
 def check_turns(
-    what: str, reference: Reference, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]
-) -> bool:
-    """Return whether rotations (N, 3, 3) agree with the gyro; False also where the recording is too short or straight.
+    what: str, reference: Reference, t_ns: IntArray, R_world_body: Array, readings: Iterable[Reading]
+) -> Turns:
+    """Hold rotations (N, 3, 3) against the gyro; neither is found where the recording is too short or straight.
 
     Raises DataError where they agree under one of the readings, and neither as given nor with other axes of the body:
     misread rotations turn the other way and about other axes.
     """
     within = stamps_among(t_ns, reference.rates_t_ns)
-    steps, given = Steps.of(t_ns[within]), R_world_imu[within]
+    steps, given = Steps.of(t_ns[within]), R_world_body[within]
     if steps.start.size < 2:
-        return False
+        return Turns(confirmed=False)
     measured, rates = steps.mean_rates(reference), steps.rates(given)
-    as_given = _correlation(rates, measured)
+    turn = _turn_between(rates, measured)
+    as_given, turned = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
+    far_better = 1.0 - _UNEXPLAINED_SHARE * (1.0 - as_given)
+    is_other = steps.start.size >= _FEWEST_STEPS and turned > max(_TURNED_CORRELATION, far_better)
+    other = turn if is_other and so3_angle(turn) > _OTHER_AXES_RAD else None
     if as_given > _SURE_CORRELATION:
-        return True
+        return Turns(True, other)
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
-    turned = _correlation(rates @ _turn_between(rates, measured).T, measured)
-    least = 1.0 - min(_UNEXPLAINED_SHARE * (1.0 - as_given), _FITTED_MORE * (1.0 - turned))
-    if fit > max(_FITTING_CORRELATION, least):
+    if fit > max(_FITTING_CORRELATION, far_better, 1.0 - _FITTED_MORE * (1.0 - turned)):
         raise _only_if(what, reference, best)
-    return as_given > _FITTING_CORRELATION and as_given >= fit
-
-
-def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
-    """Return R_reference_body (3, 3) where rotations (N, 3, 3) are those of a body with other axes, or None.
-
-    Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
-    they are. A camera's poses beside an IMU's are the usual case.
-    """
-    within = stamps_among(t_ns, reference.rates_t_ns)
-    steps = Steps.of(t_ns[within])
-    if steps.start.size < _FEWEST_STEPS:
-        return None
-    measured, rates = steps.mean_rates(reference), steps.rates(R_world_body[within])
-    turn = _turn_between(rates, measured)
-    as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
-    is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
-    return turn if is_other and so3_angle(turn) > _OTHER_AXES_RAD else None
+    return Turns(as_given > max(_FITTING_CORRELATION, fit), other)
 
 
 def _turn_between(one: Array, other: Array) -> Array:
@@ -400,8 +396,7 @@ def _body(
         raise _only_if(what, reference, _EACH_INVERTED)
     some = slice(None, None, 1 + len(file) // _ENOUGH_TURNS)
     t_ns, R_world_body = t_ns[some], file.T_world_imu[some, :3, :3]
-    confirmed = check_turns(what, reference, t_ns, R_world_body, others)
-    turn = _turned_body(reference, t_ns, R_world_body)
+    confirmed, turn = check_turns(what, reference, t_ns, R_world_body, others)
     if turn is None and matched is not None:
         turn = _turned_on_a_line(*matched)
     if not confirmed and turn is None:
