@@ -13,8 +13,8 @@ import pytest
 import toolkit
 from toolkit.cli import main
 from toolkit.datasets import own_tables
+from toolkit.datasets.io.tables import imu_columns
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.estimate import Trajectory
 from toolkit.measurements import is_left_only
 from toolkit.sequence import Sequence

@@ -29,9 +29,8 @@ from toolkit.datasets.io.image_pairs import (
     pairs_of_asl,
     seen_in,
 )
-from toolkit.datasets.io.tables import columns_of_file, headings_of, read_stamps
+from toolkit.datasets.io.tables import columns_of_file, headings_of, imu_columns, read_stamps
 from toolkit.datasets.io.truth import find_truth, seconds_apart, stamps_within, truth_at, truth_near
-from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified

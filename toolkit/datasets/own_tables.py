@@ -16,10 +16,17 @@ import numpy as np
 
 from toolkit.datasets import vislam_recording
 from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, joined_imu, observations
-from toolkit.datasets.io.tables import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file, find_table
+from toolkit.datasets.io.tables import (
+    NANOSECONDS,
+    SECONDS,
+    Columns,
+    columns_given,
+    columns_of_file,
+    find_table,
+    imu_columns,
+)
 from toolkit.datasets.io.truth import TruthRead, load_truth, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
-from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.geometry import Array, IntArray

@@ -22,7 +22,7 @@ import numpy as np
 
 from toolkit.datasets.io.bag_reader import place_in_bag
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
-from toolkit.datasets.io.tables import is_number
+from toolkit.datasets.io.tables import Named, is_number, is_of_the_globe, named_columns
 from toolkit.datasets.trajectories.covariances import (
     OPENVINS,
     OURS,
@@ -33,7 +33,6 @@ from toolkit.datasets.trajectories.covariances import (
     said_in,
     written_as,
 )
-from toolkit.datasets.trajectories.headings import Named, is_of_the_globe, named_columns
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.files.reading import read_text_input
