@@ -897,7 +897,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (
             both(without("imu0"), more(*imu("/imu", 10**12), *imu("/imu0"))),
-            "two clocks; stamp both by one, or name another topic with --topics imu=TOPIC",
+            "two recordings; stamp both by one, or name another topic with --topics imu=TOPIC",
             TOPICS("imu=/imu0"),
         ),
         (without("imu0"), "convert the topic that measures the motion to sensor_msgs/Imu (m/s^2, rad/s; "),

@@ -23,8 +23,8 @@ import numpy as np
 from toolkit.datasets.io import bag_reader as ros
 from toolkit.datasets.io.bag_reader import Bag, Message, Topic, Tree
 from toolkit.datasets.io.euroc_calibration import AS_STATED, NO_NOISE, kalibr_noise, lens_of, read_calibration
-from toolkit.datasets.io.fields import camera_matrix, check_frame_count, joined_imu
-from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, pinhole_of, seen_in
+from toolkit.datasets.io.fields import camera_matrix, joined_imu
+from toolkit.datasets.io.image_pairs import images_only, pairs_of_asl, pinhole_of, seen_in
 from toolkit.datasets.io.truth import OF_POSITIONS, truth_near, with_truth
 from toolkit.datasets.trajectories.covariances import ROS, CovConvention, StatedCovariances
 from toolkit.datasets.trajectories.formats import PosesFile, checked_poses, known_poses, states_turns
@@ -41,7 +41,7 @@ from toolkit.frontend import (
 )
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.measurements import NS_PER_S, MotionNoise
+from toolkit.measurements import MotionNoise
 from toolkit.models.noise import mems_imu, twist_noise
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.progress import SILENT, Progress
@@ -115,23 +115,15 @@ def _read(
         truth, whose = _truth(source)
         unstamped = _spool_images(bag, chosen, spool, progress)
     listed = pairs_of_asl(spool.folder).shifted(camera.shift_s)
-    within = listed.within(motion.t_ns)
-    if not within.pairs:
-        raise DataError(f"{path}: {_why_no_pairs(chosen, listed, motion)}")
-    check_frame_count(path, len(within.pairs))
+    if not listed.pairs:
+        sides = f"no image of {chosen['left'].name} has one of {chosen['right'].name} within 1 ms"
+        remedy = "synchronise the cameras, or correct the stamps"
+        raise DataError(f"{path}: {sides} ({listed.stamps} left ones); {remedy}")
+    remedy = "; stamp both by one, or name another topic with --topics imu=TOPIC"
+    within = listed.within(path, motion.t_ns, "the samples of the motion", remedy)
     camera = _as_filmed(camera, within.pairs, frontend)
     facts = (*within.remarks, *unstamped, *how_moved, *whose, *topics, *camera.facts)
     return camera, within.pairs, motion, truth, facts
-
-
-def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
-    if not listed.pairs:
-        sides = f"no image of {chosen['left'].name} has one of {chosen['right'].name} within 1 ms"
-        return f"{sides} ({listed.stamps} left ones); synchronise the cameras, or correct the stamps"
-    ranges = ((listed.pairs[0].t_ns, listed.pairs[-1].t_ns), (int(motion.t_ns.min()), int(motion.t_ns.max())))
-    images, measured = (f"{first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s" for first, last in ranges)
-    remedy = "stamp both by one, or name another topic with --topics imu=TOPIC"
-    return f"by their stamps the images are of {images} and the motion of {measured}: two clocks; {remedy}"
 
 
 def _as_filmed(camera: Mounted, pairs: Sequence[StampedPair], frontend: Frontend) -> Mounted:

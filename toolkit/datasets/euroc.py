@@ -20,15 +20,7 @@ import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import PIXEL_SIGMA_PX, AslCalibration, published, read_calibration
 from toolkit.datasets.io.fields import check_frame_count
-from toolkit.datasets.io.image_pairs import (
-    Listed,
-    check_both_cameras,
-    check_one_clock,
-    image_folder,
-    images_in,
-    pairs_of_asl,
-    seen_in,
-)
+from toolkit.datasets.io.image_pairs import Listed, check_both_cameras, image_folder, images_in, pairs_of_asl, seen_in
 from toolkit.datasets.io.tables import columns_of_file, headings_of, imu_columns, read_stamps
 from toolkit.datasets.io.truth import find_truth, seconds_apart, stamps_within, truth_at, truth_near
 from toolkit.errors import DataError, printable
@@ -249,9 +241,7 @@ def _filmed(
     listed = listed.shifted(calibration.shift_s)
     shifted = f" (timeshift_cam_imu, {calibration.shift_s:g} s, is added to the images')" if calibration.shift_s else ""
     samples = f"the samples of the IMU{shifted}"
-    check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, samples)
-    within = listed.within(imu.t_ns)
-    check_frame_count(layout.root, len(within.pairs))
+    within = listed.within(layout.root, imu.t_ns, samples)
     rig = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
     return ImageRecording(within.pairs, rig), within.remarks
 

@@ -62,10 +62,15 @@ class Listed:
         shift_ns = round(shift_s * NS_PER_S)
         return replace(self, pairs=tuple(replace(pair, t_ns=pair.t_ns + shift_ns) for pair in self.pairs))
 
-    def within(self, motion_t_ns: IntArray) -> "Listed":
-        """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out."""
+    def within(self, root: Path, motion_t_ns: IntArray, motion: str, remedy: str = "") -> "Listed":
+        """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out.
+
+        Raises DataError as :func:`check_one_clock`, or where fewer than two pairs are left.
+        """
+        check_one_clock(root, np.array([pair.t_ns for pair in self.pairs]), motion_t_ns, motion, remedy)
         first, last = int(motion_t_ns.min()), int(motion_t_ns.max())
         pairs = tuple(pair for pair in self.pairs if first <= pair.t_ns <= last)
+        check_frame_count(root, len(pairs))
         outside = len(self.pairs) - len(pairs)
         remark = f"{outside} of {len(self.pairs)} image pairs are outside the time of the motion samples and left out"
         return replace(self, pairs=pairs, remarks=(*self.remarks, remark)) if outside else self
@@ -287,13 +292,16 @@ def check_several_stamps(path: Path, listed: Listed) -> None:
     check_frame_count(path, len(listed.pairs))
 
 
-def check_one_clock(root: Path, images_t_ns: IntArray, motion_t_ns: IntArray, motion: str) -> None:
-    """Raise DataError where no image (N,) lies in the time of the motion samples (S,), which ``motion`` names."""
+def check_one_clock(root: Path, images_t_ns: IntArray, motion_t_ns: IntArray, motion: str, remedy: str = "") -> None:
+    """Raise DataError where no image (N,) lies in the time of the motion samples (S,), which ``motion`` names.
+
+    The remedy is for two clocks that count alike.
+    """
     first, last = int(motion_t_ns.min()), int(motion_t_ns.max())
     if first == last:
         raise DataError(f"{root}: {motion} are all of one instant, {first} ns; copy the whole recording again")
     if not ((images_t_ns >= first) & (images_t_ns <= last)).any():
         unit = probable_unit_of_ns(images_t_ns)
-        why = "they are of two clocks or two recordings" if unit is None else f"the images' look like {unit}"
+        why = f"they are of two clocks or two recordings{remedy}" if unit is None else f"the images' look like {unit}"
         pairs = f"{images_t_ns.size} image pairs, {images_t_ns.min()} to {images_t_ns.max()} ns"
         raise DataError(f"{root}: none of the {pairs}, lies in the time of {motion}, {first} to {last} ns; {why}")
