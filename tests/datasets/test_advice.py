@@ -769,7 +769,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (lambda case: [path.unlink() for path in case.at.glob("*/*.png")], "with images; unpack them there (.png"),
         (swap("image_0", "image_1"), "exchange the two, or turn the images back"),
         (pixels("image_?/*.png", lambda image: image[:, ::-1]), "the images back if all are upside down or mirrored"),
-        (rolled, "one camera began earlier or dropped an image; pair them by when they were taken", later(1)),
+        (
+            rolled,
+            "the pair before theirs: one camera began earlier or dropped an image; pair them by when they were taken",
+            later(1),
+        ),
         (pixels("image_1/*.png", lambda image: image[::2, ::2]), "cut or turned, do the same to the calibration"),
         (pixels("image_?/*.png", lambda image: image.astype(np.float32), ".tif"), "convert the images to 8 or 16 bits"),
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
@@ -805,6 +809,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     ],
     "asl": [
         (gone(TABLES[0], *IMAGES), "cam0/data.csv: cannot be read"),
+        (gone("mav0/cam1"), "there is cam0 and no cam1; stereo needs both"),
         (edit("mav0/imu0/data.csv", "w_RS_S_y", "rate_y"), "imu0/data.csv: missing column w_RS_S_y"),
         (edit(YAMLS[0], "100.0]", "100.0"), "line 11: expected "),
         (text(YAMLS[0], BOMB), "values, with those that aliases (*name) repeat"),

@@ -74,9 +74,9 @@ class Filmed:
         return np.asarray(points_rect @ rig.R_rect_cam - along(k)[:3, 3])
 
 
-def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3, every: int = 1) -> list[Pair]:
-    """Return the images of both cameras along the motion, of one frame in so many."""
-    poses = [(k, along(k)) for k in range(0, every * frames, every)]
+def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3) -> list[Pair]:
+    """Return the images of both cameras along the motion."""
+    poses = [(k, along(k)) for k in range(frames)]
     left, right = cameras
     return [(seen(seed, left, T, 2 * k), seen(seed, right, T_right_left @ T, 2 * k + 1)) for k, T in poses]
 
@@ -85,12 +85,6 @@ def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed:
 def plain() -> Filmed:
     """Return a film of cameras without distortion that are mounted perfectly."""
     return Filmed(already_rectified(PLAIN.pinhole_px, BASELINE_M, SIZE), film((PLAIN, PLAIN), RECTIFIED, 10))
-
-
-@pytest.fixture(scope="session")
-def hasty() -> Filmed:
-    """Return a film whose rows move by ten pixels from pair to pair."""
-    return Filmed(already_rectified(PLAIN.pinhole_px, BASELINE_M, SIZE), film((PLAIN, PLAIN), RECTIFIED, 5, every=8))
 
 
 @pytest.fixture(scope="session")

@@ -68,24 +68,6 @@ def test_what_kalibrs_bag_extractor_writes_is_a_recording(asl: Path) -> None:
     assert (load_sequence(str(asl / "extracted")).motion.values == motion.values).all()
 
 
-@pytest.mark.parametrize(
-    ("remove", "words"),
-    [
-        (lambda root: shutil.rmtree(root / "mav0/cam1"), "there is cam0 and no cam1; stereo needs both"),
-        (
-            lambda root: (root / "mav0/imu0/data.csv").unlink(),
-            "no imu0.csv of Kalibr's: name the folder that has mav0, or rectify",
-        ),
-    ],
-)
-def test_what_lacks_of_a_recording_is_reported_with_what_to_do(
-    asl: Path, remove: Callable[[Path], object], words: str
-) -> None:
-    remove(asl)
-    with pytest.raises(DataError, match=words):
-        load_sequence(str(asl))
-
-
 @pytest.mark.parametrize("part", ["mav0/cam0/data", "mav0/cam0", "mav0/imu0/data.csv"])
 def test_of_a_part_of_a_recording_the_whole_is_named(asl: Path, part: str) -> None:
     with pytest.raises(

@@ -1,7 +1,6 @@
 """Stereo tracks on images whose geometry is known: places, depths, ids, and what each gate keeps out."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.frontend.conftest import BOARD_M, FRAMES, WALL_M, Filmed
-from toolkit.errors import DataError
-from toolkit.frontend import StampedPair, motion, track_images
+from toolkit.frontend import motion
 from toolkit.frontend.tracker import TrackedCorners, Tracker
 from toolkit.geometry import Array
 from toolkit.settings import DEFAULTS, Frontend
@@ -116,19 +114,6 @@ def test_a_right_image_of_another_instant_is_refused_and_the_tracks_go_on(plain:
     assert before is not None
     assert after is not None
     assert np.isin(before.track_ids, after.track_ids).mean() > 0.6
-
-
-@pytest.mark.parametrize(("late", "which"), [(-1, "after"), (1, "before")])
-def test_of_a_right_camera_that_is_one_pair_late_or_early_the_partner_is_reported(
-    hasty: Filmed, tmp_path: Path, late: int, which: str
-) -> None:
-    last = len(hasty.images) - 1
-    pairs = [StampedPair(100 * k, *(tmp_path / f"{k}{side}.png" for side in "lr")) for k in range(1, last)]
-    for k, pair in enumerate(pairs, start=1):
-        cv2.imwrite(str(pair.left), hasty.images[k][0])
-        cv2.imwrite(str(pair.right), hasty.images[k + late][1])
-    with pytest.raises(DataError, match=f"left images match the right images of the pair {which} theirs"):
-        track_images(pairs, hasty.rig, Frontend())
 
 
 def test_a_change_of_exposure_ends_no_track(plain: Filmed) -> None:
