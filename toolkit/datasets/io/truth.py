@@ -16,7 +16,7 @@ from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.tables import columns_of_file, headings_of
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.belonging import Reference, Steps, check_clock, check_turns, stamps_among, turned
+from toolkit.datasets.trajectories.belonging import Reference, Steps, check_clock, check_turns, stamps_among, values_at
 from toolkit.datasets.trajectories.formats import (
     POSITIONS_ALONE,
     checked_poses,
@@ -26,7 +26,7 @@ from toolkit.datasets.trajectories.formats import (
 )
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
-from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse
+from toolkit.geometry import IntArray, interpolate_poses, se3_inverse
 from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence, Truth
@@ -124,14 +124,8 @@ def truth_near(truth: Truth, t_ns: IntArray) -> Truth:
 def truth_at(truth: Truth, t_ns: IntArray) -> Truth:
     """Return the truth at stamps (K,) within it: poses on the geodesic, velocities and biases on straight lines."""
     poses = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns)
-    return Truth(t_ns, poses, _linear(truth.v_world, truth.t_ns, t_ns), _linear(truth.bias, truth.t_ns, t_ns))
-
-
-def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | None:
-    if values is None:
-        return None
-    t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
-    return np.stack([np.interp(at_s, t_s, column) for column in values.T], axis=1)
+    v_world, bias = (None if one is None else values_at(truth.t_ns, one, t_ns) for one in (truth.v_world, truth.bias))
+    return Truth(t_ns, poses, v_world, bias)
 
 
 # Of EuRoC recordings -----------------------------------------------------------------------------------------------
@@ -218,8 +212,7 @@ def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
     known = steps.duration_s < _LONGEST_STEP_S
     if known.sum() < 2:
         return float("inf"), 0.0
-    turned_rad = turned(sample_t_ns, gyro_radps, steps.t_ns)
-    measured = ((turned_rad[steps.end] - turned_rad[steps.start]) / steps.duration_s[:, None])[known]
+    measured = steps.mean_rates(sample_t_ns, gyro_radps)[known]
     off = steps.rates(truth.T_world_imu[within, :3, :3])[known] - measured
     of_gyro, apart = (float(np.sqrt(((x - np.median(x, axis=0)) ** 2).mean())) for x in (measured, off))
     return apart, of_gyro

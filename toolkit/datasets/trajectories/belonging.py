@@ -217,9 +217,9 @@ def _check_length_unit(what: str, reference: Reference, t_ns: IntArray, position
     """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
     steps = Steps.of(t_ns)
     if reference.positions_t_ns.size > 1:
-        measured_mps = steps.speeds(_at(reference.positions_t_ns, reference.positions, t_ns))
+        measured_mps = steps.speeds(values_at(reference.positions_t_ns, reference.positions, t_ns))
     elif reference.rates_t_ns.size > 1:
-        measured_mps = _at(reference.rates_t_ns, reference.speeds_mps[:, None], t_ns[steps.start])[:, 0]
+        measured_mps = values_at(reference.rates_t_ns, reference.speeds_mps[:, None], t_ns[steps.start])[:, 0]
     else:
         return
     known = np.isfinite(measured_mps) & (measured_mps > _MOVING_MPS)
@@ -232,7 +232,7 @@ def _check_length_unit(what: str, reference: Reference, t_ns: IntArray, position
             raise DataError(f"{reference.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
 
 
-def _at(t_ns: IntArray, values: Array, at_ns: IntArray) -> Array:
+def values_at(t_ns: IntArray, values: Array, at_ns: IntArray) -> Array:
     """Return values (S, C) on stamps, taken as straight lines, at others (N,); NaN outside their time."""
     t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
     return np.stack([np.interp(at_s, t_s, column, np.nan, np.nan) for column in values.T], axis=1)
@@ -261,15 +261,16 @@ class Steps(NamedTuple):
         turns = so3_log(transposed(R_world_imu[self.start]) @ R_world_imu[self.end])
         return np.asarray(turns / self.duration_s[:, None])
 
-    def mean_rates(self, reference: Reference) -> Array:
-        at_stamps = turned(reference.rates_t_ns, reference.rates_radps, self.t_ns)
+    def mean_rates(self, sample_t_ns: IntArray, rates_radps: Array) -> Array:
+        """Return the means (M, 3) of rates (S, 3) rad/s that are measured at stamps (S,)."""
+        at_stamps = _turned(sample_t_ns, rates_radps, self.t_ns)
         return np.asarray((at_stamps[self.end] - at_stamps[self.start]) / self.duration_s[:, None])
 
     def speeds(self, positions: Array) -> Array:
         return np.asarray(np.linalg.norm(positions[self.end] - positions[self.start], axis=1) / self.duration_s)
 
 
-def turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
+def _turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
     """Return the integrals (N, 3) rad of rates (S, 3), taken as straight lines, from the first to stamps (N,)."""
     sample_s, at_s = (sample_t_ns - sample_t_ns[0]) / NS_PER_S, (at_ns - sample_t_ns[0]) / NS_PER_S
     areas = 0.5 * (rates_radps[1:] + rates_radps[:-1]) * np.diff(sample_s)[:, None]
@@ -300,8 +301,8 @@ def check_turns(
     steps, given = Steps.of(t_ns[within]), R_world_body[within]
     if steps.start.size < 2:
         return Turns(confirmed=False)
-    measured, rates = steps.mean_rates(reference), steps.rates(given)
-    turn = _turn_between(rates, measured)
+    measured, rates = steps.mean_rates(reference.rates_t_ns, reference.rates_radps), steps.rates(given)
+    turn, _ = nearest_rotation((measured - measured.mean(axis=0)).T @ (rates - rates.mean(axis=0)))
     as_given, turned = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
     far_better = 1.0 - _UNEXPLAINED_SHARE * (1.0 - as_given)
     is_other = steps.start.size >= _FEWEST_STEPS and turned > max(_TURNED_CORRELATION, far_better)
@@ -313,11 +314,6 @@ def check_turns(
     if fit > max(_FITTING_CORRELATION, far_better, 1.0 - _FITTED_MORE * (1.0 - turned)):
         raise _only_if(what, reference, best)
     return Turns(as_given > max(_FITTING_CORRELATION, fit), other)
-
-
-def _turn_between(one: Array, other: Array) -> Array:
-    """Return the turn (3, 3) that takes a series (N, 3) nearest to another about their means (Kabsch 1976)."""
-    return nearest_rotation((other - other.mean(axis=0)).T @ (one - one.mean(axis=0)))[0]
 
 
 def stamps_among(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
