@@ -14,7 +14,6 @@ import re
 import struct
 import zipfile
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -173,11 +172,7 @@ def opened(path: Path) -> Iterator[NpzArchive]:
     """Open an archive; damage met while it is open is raised as DataError."""
     try:
         with open_input(path) as file, zipfile.ZipFile(file) as archive:
-            found = NpzArchive(path, archive)
-            twice = [key for key, times in Counter(found.keys).items() if times > 1]
-            if twice:
-                raise DataError(f"{path}: {twice[0]} is in the archive twice; save it with one array of that name")
-            yield found
+            yield NpzArchive(path, archive)
     except (OSError, *_DAMAGED_ZIP) as error:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
 
