@@ -113,7 +113,7 @@ def main(words: list[str]) -> int:
     for recording in wanted.recordings:
         sequence = load_sequence(recording)
         if wanted.truth is not None:
-            sequence = with_truth(sequence, load_truth(wanted.truth))
+            sequence = with_truth(sequence, *load_truth(wanted.truth))
         counts.append(print_table(sequence.truncated(wanted.frames), wanted))
     silent, cells = map(sum, zip(*counts, strict=True))
     print(f"\n{silent} of {cells} cells are above {wanted.limit:g} and say nothing")
