@@ -69,16 +69,14 @@ _VEHICLE_CONCENTRATION, _LEAST_GAIN, _UNEXPLAINED_BENDS = 0.97, 0.1, 0.1
 class Rows:
     """What a table in a text file holds: the number and the cells of each line that is not empty or a comment.
 
-    There is at least one line. ``commas``: they separate the cells, and not blanks. ``underscored``: a cell has an
-    underscore, and Python takes 1_0 for ten. ``heading``: the names of the columns, of a line above the first row with
-    as many words as that has cells. ``header``: all comments before that row.
+    There is at least one line. ``commas``: they separate the cells, and not blanks. ``heading``: the names of the
+    columns, of a line above the first row with as many words as that has cells. ``header``: all comments before it.
     """
 
     path: Path
     line_numbers: list[int]
     cells: list[list[str]]
     commas: bool
-    underscored: bool = False
     heading: tuple[str, ...] = ()
     header: str = ""
 
@@ -88,18 +86,17 @@ class Rows:
 
     def numbers(self, width: int, columns: str) -> Array:
         """Return all cells as numbers (N, width); raises DataError naming the line that has not these ``columns``."""
-        if not self.underscored and set(map(len, self.cells)) == {width}:
+        # Python takes 1_0 for ten.
+        if all(len(of_line) == width and "_" not in "".join(of_line) for of_line in self.cells):
             with suppress(ValueError):  # told below, with the line
                 return np.fromiter(map(float, chain.from_iterable(self.cells)), dtype=float).reshape(-1, width)
-        return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
+        lines = zip(self.line_numbers, self.cells, strict=True)
+        return np.array([self._numbers(n, cells, width, columns) for n, cells in lines], dtype=float)
 
     def stamps(self, per_unit_ns: int, at: int = 0) -> IntArray:
         """Return a column in units of ``per_unit_ns`` as :func:`exact_ns` does; raises DataError naming the line."""
         cells = [of_line[at] for of_line in self.cells]
         return exact_ns(cells, per_unit_ns, lambda row: f"{self.path}: line {self.line_numbers[row]}")
-
-    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
-        return zip(self.line_numbers, self.cells, strict=True)
 
     def _numbers(self, line_number: int, cells: list[str], width: int, columns: str) -> list[float]:
         what = f"{self.path}: line {line_number}"
@@ -140,9 +137,8 @@ def read_rows(path: Path, kind: str) -> Rows:
         raise DataError(f"{path}: its positions are latitude and longitude; convert them to metres (ENU, UTM)")
     headings = [one for one in headings if len(one) == len(cells[0]) and named_columns(one) is not None]
     heading = tuple(headings[-1]) if headings else ()
-    underscored = "_" in text and any("_" in line for line in lines)
     header = "\n".join(takewhile(lambda line: line.lstrip().startswith("#"), text.splitlines()))
-    return Rows(path, line_numbers, cells, separator is not None, underscored, heading, header)
+    return Rows(path, line_numbers, cells, separator is not None, heading, header)
 
 
 def stamp_text(t_ns: int) -> str:
