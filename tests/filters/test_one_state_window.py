@@ -1,6 +1,6 @@
 """The window at its one end: the newest state alone is a joint Kalman filter, and of `sliding-window` `iekf` (4 s).
 
-Where the problem is linear it is the batch: test_joint_ekf_equals_batch.py. At its other end, with all states in it, it
+Where the problem is linear it is the batch: test_linear_problems.py. At its other end, with all states in it, it
 is the batch everywhere: test_infinite_lag.py.
 """
 

@@ -1,6 +1,6 @@
 """Tracks of an MSCKF: their kernels against the textbook in dense matrices, the gate's policy, the answer in view.
 
-That the filter as a whole is one Gauss-Newton step is proved in test_msckf_equals_elimination.py.
+That the filter as a whole is one Gauss-Newton step is proved in test_linear_problems.py.
 """
 
 import subprocess
@@ -24,7 +24,7 @@ from filters.kalman.tracks import (
     given_tracks_in_view,
 )
 from tests.filters.conftest import update_by_rows, with_clones
-from toolkit.geometry import se3, so3_exp
+from toolkit.geometry import se3, se3_inverse, se3_log, so3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, FrameGate, chi2_bound
@@ -340,6 +340,31 @@ def test_the_belief_is_left_as_it_was(flight):
     np.testing.assert_array_equal(joint.cov, before.cov)
     np.testing.assert_array_equal(joint.clones, before.clones)
     assert np.linalg.det(answer.cov[:6, :6]) < 0.1 * np.linalg.det(joint.core.cov[:6, :6])
+
+
+# The update by information.
+
+
+@pytest.mark.parametrize("rows", [5, 60])
+@pytest.mark.parametrize("first", [0, 2], ids=["of all clones", "of the newest"])
+def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(rows, first):
+    _, joint = with_clones(replace(FLIGHT, duration_s=0.5), 0, VIEWS)
+    rng = np.random.default_rng(6)
+    begin, end = joint.clone_columns.start + 6 * first, joint.clone_columns.stop
+    H, residuals = 100.0 * rng.normal(size=(rows, end - begin)), rng.normal(size=rows)
+    core, clones, other, sigmas = joint.core, joint.clones, copy(joint), np.sqrt(np.diag(joint.cov))
+    update_by_rows(joint, H, residuals, slice(begin, end))
+    information, most = H.T @ H, 2.0 * (H**2).sum()
+    taken = np.linalg.cholesky(most * np.eye(len(information)) - information).T
+    other.inform(np.tile(most * np.eye(6), (len(information) // 6, 1, 1)), taken, H.T @ residuals)
+    steps, others = (
+        np.concatenate([core.error_to(it.core), se3_log(se3_inverse(clones) @ it.clones).ravel()])
+        for it in (joint, other)
+    )
+    assert np.abs(steps).max() > 1e-3, "there was something to agree on"
+    np.testing.assert_allclose(others, steps, atol=1e-9)
+    np.testing.assert_allclose(other.cov / np.outer(sigmas, sigmas), joint.cov / np.outer(sigmas, sigmas), atol=1e-9)
+    np.testing.assert_array_equal(other.cov, other.cov.T)
 
 
 # How the kernels are compiled.
