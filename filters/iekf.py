@@ -65,20 +65,6 @@ class Iterate(NamedTuple):
     cost: float
 
 
-class PullStep(NamedTuple):
-    """A change of the pull (k,), and the length of the resulting correction in standard deviations after the update."""
-
-    pull: Array
-    length: float
-
-
-class IterationResult(NamedTuple):
-    """The correction of lowest cost that was found, and whether the iteration converged."""
-
-    best: Iterate
-    converged: bool
-
-
 def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct the whole state by its landmarks; the frame must show every one of them.
 
@@ -125,8 +111,11 @@ class Measurement:
         cost = float(prior + self.weights @ np.square(seen.residuals).sum(axis=1)) if in_front else np.inf
         return Iterate(delta, pull, seen, cost)
 
-    def step(self, now: Iterate) -> PullStep:
-        """Return the step to the minimum of the cost linearised at an iterate."""
+    def step(self, now: Iterate) -> tuple[Array, float]:
+        """Return the step (k,) of the pull to the minimum of the cost linearised at an iterate, and its length.
+
+        That is the length of the resulting correction, in standard deviations after the update.
+        """
         P = self.prediction.cov[self.part, self.part]
         H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
         H, residuals = self.stacked(now.seen._replace(H_pose=H_pose, H_point=H_point))
@@ -135,7 +124,7 @@ class Measurement:
         innovation_cov.flat[:: len(carried) + 1] += 1.0
         pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[self.part]) - now.pull
         # |step|^2 in the metric P^-1 + H^T H
-        return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
+        return pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum()))
 
     def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks with non-zero weight, stacked."""
@@ -148,16 +137,19 @@ class Measurement:
         return H, (roots[..., 0] * seen.residuals[rows]).ravel()
 
 
-def most_probable(measurement: Measurement) -> IterationResult:
-    """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
+def most_probable(measurement: Measurement) -> tuple[Iterate, bool]:
+    """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible.
+
+    Return the correction of lowest cost that was found, and whether the iteration converged.
+    """
     now = measurement.after(np.zeros(measurement.part.stop - measurement.part.start))
     for _ in range(MOST_STEPS):
-        step = measurement.step(now)
-        if step.length < NEGLIGIBLE_STEP:
-            return IterationResult(measurement.after(now.pull + step.pull), converged=True)
-        shortened = (measurement.after(now.pull + 0.5**halvings * step.pull) for halvings in range(MOST_HALVINGS + 1))
+        step, length = measurement.step(now)
+        if length < NEGLIGIBLE_STEP:
+            return measurement.after(now.pull + step), True
+        shortened = (measurement.after(now.pull + 0.5**halvings * step) for halvings in range(MOST_HALVINGS + 1))
         lower = next((then for then in shortened if then.cost < now.cost), None)
         if lower is None:
-            return IterationResult(now, converged=False)
+            break
         now = lower
-    return IterationResult(now, converged=False)
+    return now, False

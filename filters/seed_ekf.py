@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, informed
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, informed, residuals_with_jacobians
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
@@ -52,9 +52,7 @@ class SeedEkf(Filter):
         return self._belief.estimate(packet.frame.t_ns)
 
     def _correct_pose(self, seen: LandmarkMap, uvs_px: Array) -> None:
-        predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
-        residual_px = stereo.residuals_px(uvs_px, predicted.uv_px)
-        H_pose = stereo.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        residual_px, H_pose, *_ = residuals_with_jacobians(seen, uvs_px, self._belief.T_world_imu, self._rig)
         noise_px2 = stereo.noise_px2(uvs_px, self._rig) / self._rig.track_weight
         rows = np.asarray(np.linalg.solve(noise_px2, H_pose)).reshape(-1, 6)
         self._belief = informed(self._belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1))

@@ -81,26 +81,16 @@ def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: 
     return LandmarkMap(frame.track_ids[rows][near], *started(uvs_px[near], T_world_imu, rig))
 
 
-class SightingResiduals(NamedTuple):
-    """Residuals (N, 3) px of sightings, with Jacobians (N, 3, 6) and (N, 3, 3), and the predicted depths (N,) m."""
-
-    residual_px: Array
-    H_pose: Array
-    H_point: Array
-    depth_m: Array
-
-
 def residuals_with_jacobians(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig
-) -> SightingResiduals:
-    """Return the residuals of sightings (N, 3) px from a pose (4, 4), with Jacobians; zero where uR is missing."""
-    predicted = stereo.predict(landmarks.points, T_world_imu, rig)
-    return SightingResiduals(
-        stereo.residuals_px(uvs_px, predicted.uv_px),
-        stereo.seen_rows(uvs_px, predicted.d_uv_d_pose),
-        stereo.seen_rows(uvs_px, predicted.d_uv_d_point),
-        predicted.depth_m,
-    )
+) -> tuple[Array, Array, Array, Array]:
+    """Return residuals (N, 3) px of sightings (N, 3) px from a pose (4, 4), zero where uR is missing.
+
+    With them their Jacobians to the pose (N, 3, 6) and to the landmarks (N, 3, 3), and the predicted depths (N,) m.
+    """
+    seen = stereo.predict(landmarks.points, T_world_imu, rig)
+    H_pose, H_point = (stereo.seen_rows(uvs_px, H) for H in (seen.d_uv_d_pose, seen.d_uv_d_point))
+    return stereo.residuals_px(uvs_px, seen.uv_px), H_pose, H_point, seen.depth_m
 
 
 def carried(H_pose: Array, pose_cov: Array) -> Array:

@@ -204,7 +204,7 @@ class FixedLagTree:
         variables keep their linearisation points. The tree that made them fixes those; for the next tree they must
         be passed on.
         """
-        factors, values = _without_ties(without_gaps(self._isam.getFactorsUnsafe())), self._isam.getLinearizationPoint()
+        factors, values = without_gaps(self._isam.getFactorsUnsafe(), but=LAST), self._isam.getLinearizationPoint()
         self._tie_slots = []
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
@@ -280,15 +280,6 @@ def _is_removed_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
     """Say whether a factor is removed with a landmark: a sighting, or a linear factor on it alone."""
     keys: list[int] = factor.keys()
     return landmark in keys and (len(keys) == 1 or not isinstance(factor, gtsam.LinearContainerFactor))
-
-
-def _without_ties(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """Return the factors except those on the dummy variable."""
-    kept = gtsam.NonlinearFactorGraph()
-    for factor in (factors.at(i) for i in range(factors.size())):
-        if LAST not in factor.keys():  # noqa: SIM118 - not a mapping
-            kept.add(factor)
-    return kept
 
 
 def _oldest_beside_newest(stamps_ns: list[int]) -> list[int]:

@@ -119,10 +119,11 @@ def with_the_last_tied(
     return factors, values
 
 
-def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+def without_gaps(factors: gtsam.NonlinearFactorGraph, but: int | None = None) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of a tree without its empty slots and, if it is given, without those on a variable."""
     compact = gtsam.NonlinearFactorGraph()
     for slot in range(factors.size()):
-        if factors.exists(slot):
+        if factors.exists(slot) and (but is None or but not in list(factors.at(slot).keys())):
             compact.add(factors.at(slot))
     return compact
 

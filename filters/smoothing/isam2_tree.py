@@ -22,7 +22,7 @@ of the depth: a threshold in metres that is small enough for near landmarks woul
 """
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -97,13 +97,9 @@ class FrozenVariables:
         self._last_view: dict[int, int] = {}
         self.count = 0
         self._frozen: set[int] = set()
-        self._used: set[int] = set()
+        # Those that recent frames have factors on, except those frozen before.
+        self.others: set[int] = set()
         self.keys = gtsam.KeyList()
-
-    @property
-    def others(self) -> Set[int]:
-        """Return the variables that recent frames have factors on, except those frozen before."""
-        return self._used
 
     def unused_for(self, frames: int) -> list[int]:
         """Return the listed keys that the last ``frames`` frames neither had in view nor have factors on."""
@@ -126,32 +122,32 @@ class FrozenVariables:
         frame = set(keys)
         self._recent.append(frame)
         self._last_frame |= dict.fromkeys(frame, self.count)
-        self._used |= frame - self._frozen
+        self.others |= frame - self._frozen
         if len(self._recent) > self._frames:
             oldest = self.count - self._frames
             for key in sorted(self._recent.popleft()):
                 if self._last_frame[key] == oldest and key not in self._frozen:
                     self.keys.push_back(key)
                     self._frozen.add(key)
-                    self._used.remove(key)
+                    self.others.remove(key)
         self.count += 1
 
 
 class RetiredVariables:
-    """The variables that left a tree, their factors, and the slots of these factors and of the marginals."""
+    """The variables that left a tree with their values and factors, and the slots of these and of the marginals."""
 
     def __init__(self) -> None:
         self.keys: set[int] = set()
         self.slots: set[int] = set()
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
         self._marginals: set[int] = set()
-        self._latest, self._linearised_at = gtsam.Values(), gtsam.Values()
+        self.latest, self.linearised_at = gtsam.Values(), gtsam.Values()
 
     def take(self, tree: gtsam.ISAM2, leaving: list[int]) -> None:
         """Marginalise variables that are leaves of the tree; keep them and their factors."""
         before = gtsam.NonlinearFactorGraph(tree.getFactorsUnsafe())
-        self._latest.insert(tree.calculateEstimate().extract(leaving))
-        self._linearised_at.insert(tree.getLinearizationPoint().extract(leaving))
+        self.latest.insert(tree.calculateEstimate().extract(leaving))
+        self.linearised_at.insert(tree.getLinearizationPoint().extract(leaving))
         marginals, removed = tree.marginalizeLeavesWithIndices(key_list(leaving))
         self._factors |= {slot: before.at(slot) for slot in removed if slot not in self._marginals}
         self._marginals = (self._marginals - set(removed)) | set(marginals)
@@ -166,12 +162,6 @@ class RetiredVariables:
         for slot, factor in self._factors.items():
             factors.replace(slot, factor)
         return factors
-
-    def with_values(self, of_tree: gtsam.Values) -> gtsam.Values:
-        return _joined(of_tree, self._latest)
-
-    def with_linearisation_points(self, of_tree: gtsam.Values) -> gtsam.Values:
-        return _joined(of_tree, self._linearised_at)
 
 
 def _joined(first: gtsam.Values, second: gtsam.Values) -> gtsam.Values:
@@ -229,7 +219,7 @@ class Isam2Tree:
         return without_gaps(factors)
 
     def values(self) -> gtsam.Values:
-        values = self._retired.with_values(self.isam.calculateBestEstimate())
+        values = _joined(self.isam.calculateBestEstimate(), self._retired.latest)
         values.erase(LAST)
         return values
 
@@ -247,7 +237,7 @@ class Isam2Tree:
 
     def _restored(self) -> Recovery:
         """Rebuild the tree with all variables that had left it; return the recoveries."""
-        points = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
+        points = _joined(self.isam.getLinearizationPoint(), self._retired.linearised_at)
         try:
             self._rebuild(self._retired.with_factors_of(self.isam), points)
         except RuntimeError as refusal:
@@ -431,7 +421,7 @@ class Isam2Tree:
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
             factors = self._retired.with_factors_of(self.isam)
-            values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
+            values = _joined(self.isam.getLinearizationPoint(), self._retired.linearised_at)
             if kind_of(key) == "l":
                 of_tree = without_gaps(self.isam.getFactorsUnsafe()), self.isam.getLinearizationPoint()
                 for culprit in undetermined(*of_tree) or [key]:

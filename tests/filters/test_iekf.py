@@ -201,9 +201,9 @@ def test_it_is_a_lag_zero_smoother_at_convergence(scenario) -> None:
     pose = smoothed.atPose3(X(0)).matrix()
     points = np.array([smoothed.atPoint3(L(i)) for i in joint.landmark_ids.tolist()])
     nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.landmark_columns.start))
-    single = joint.displaced(measurement.after(measurement.step(nothing).pull).delta)
+    single = joint.displaced(measurement.after(measurement.step(nothing)[0]).delta)
     moved = copy(joint)
-    moved.move(iekf.most_probable(measurement).best.delta)
+    moved.move(iekf.most_probable(measurement)[0].delta)
     gate = FrameGate(probability=1.0)
     iekf.correct(joint, frame, AT, rig, gate)
 

@@ -47,7 +47,7 @@ def first_hit(panels: tuple[Panel, ...], origin: Array, towards: Array) -> Array
 @pytest.mark.parametrize("model", ["none", "radtan", "equidistant"])
 def test_what_two_cameras_see_at_two_times_are_the_same_points(model: Distortion) -> None:
     """A point seen in one image has its grey value where the other shows it, unless something stands before it."""
-    pair, panels = filming._Pair.of(FLIGHT, model), furnished_hall().at(0.0)
+    pair, panels = filming._Pair.of(FLIGHT, model), furnished_hall()(0.0)
     poses = pose_at(2.0), pose_at(2.1) @ se3_inverse(FLIGHT.rig.T_imu_cam) @ pair.T_imu_cams[1]
     eye, camera = Eye.of(pair.camera), pair.camera
     project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints

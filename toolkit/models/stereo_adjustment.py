@@ -454,11 +454,11 @@ def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> 
     check_error(here.error)
     for _ in range(ending.iterations):
         system = here.linearised()
-        step = _descent(here, system, damping, camera)
-        decrease, here = here.error - step.there.error, step.there
-        if step.sigmas <= ending.step_sigmas or decrease <= ending.relative_decrease * here.error:
+        there, sigmas, damping = _descent(here, system, damping, camera)
+        decrease, here = here.error - there.error, there
+        if sigmas <= ending.step_sigmas or decrease <= ending.relative_decrease * here.error:
             break
-        damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
+        damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
     try:
         return SolvedWindow(here.window, system.root)
     except np.linalg.LinAlgError as refusal:
@@ -520,16 +520,11 @@ def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> St
     )
 
 
-class _DescentStep(NamedTuple):
-    """The window after a step, the step's length in standard deviations of all states together, and its damping."""
+def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> tuple[Evaluated, float, float]:
+    """Return the window after the least damped step that does not raise the cost, or after a step of length zero.
 
-    there: Evaluated
-    sigmas: float
-    damping: float
-
-
-def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _DescentStep:
-    """Return the least damped step that does not raise the cost, or a step of length zero."""
+    With it the step's length, in standard deviations of all states together, and its damping.
+    """
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
@@ -539,11 +534,11 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
             if not there.error <= here.error:
                 there = Evaluated.of(_with_shortened_landmark_steps(moved, here.window.points, camera), camera)
             if there.error <= here.error:
-                return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
+                return there, float(np.sqrt(step @ system.vector)), damping
         except np.linalg.LinAlgError:
             pass
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return _DescentStep(here, 0.0, damping)
+    return here, 0.0, damping
 
 
 def _with_shortened_landmark_steps(moved: StereoWindow, before: Array, camera: RobustCamera) -> StereoWindow:

@@ -29,7 +29,7 @@ from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
-from toolkit.simulation.renderer import Eye, Floats, Surfaces, atlas, developed, exposed, furnished_hall, light
+from toolkit.simulation.renderer import Eye, Floats, Surfaces, atlas, developed, furnished_hall, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
 from toolkit.simulation.scenes import SmoothTrajectory
 from toolkit.simulation.sensors import Imu
@@ -169,10 +169,12 @@ class _Crew:
 
         def shot(at_s: float) -> Floats:
             T_world_imu = self._trajectory.at(np.array([at_s])).T_world_imu[0]
-            return light(self._surfaces.at(at_s), self._eye, T_world_imu @ self._pair.T_imu_cams[side])
+            return light(self._surfaces(at_s), self._eye, T_world_imu @ self._pair.T_imu_cams[side])
 
         gain = (1.0 + _SWING * np.sin(2.0 * np.pi * t_s / _SWING_S + self._swing_rad)) * (_RIGHT_GAIN if side else 1.0)
-        seen = exposed(shot, t_s, self._filming.exposure_s, _SHOTS)
+        exposure_s = self._filming.exposure_s
+        shots_s = t_s + exposure_s * ((np.arange(_SHOTS) + 0.5) / _SHOTS - 0.5) if exposure_s else [t_s]
+        seen = np.asarray(np.mean([shot(float(at_s)) for at_s in shots_s], axis=0), dtype=np.float32)
         image = developed(seen, gain, self._rng(k, side))
         return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
@@ -279,7 +281,7 @@ def _met(T_world_cam: Array, rays: Array) -> Array:
     origin, towards = T_world_cam[:, :3, 3], (T_world_cam[:, :3, :3] @ rays[:, :, None])[..., 0]
     nearest = np.full(len(rays), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for panel in furnished_hall().standing:
+        for panel in furnished_hall()(0.0):
             axes, corner = panel.T_world_panel[:3, :3], panel.T_world_panel[:3, 3]
             start, step = (origin - corner) @ axes, towards @ axes
             reach = -start[:, 2] / step[:, 2]

@@ -68,15 +68,8 @@ class Panel:
         return replace(self, T_world_panel=T_world_body @ self.T_world_panel)
 
 
-@dataclass(frozen=True, eq=False)
-class Surfaces:
-    """The visible world: fixed panels, and the panels of moving bodies at any time (s)."""
-
-    standing: tuple[Panel, ...]
-    moving: Callable[[float], tuple[Panel, ...]] | None = None
-
-    def at(self, t_s: float) -> tuple[Panel, ...]:
-        return self.standing if self.moving is None else self.standing + self.moving(t_s)
+# The visible panels at any time (s).
+Surfaces = Callable[[float], tuple[Panel, ...]]
 
 
 def furnished_hall(moving: int = 0) -> Surfaces:
@@ -86,7 +79,8 @@ def furnished_hall(moving: int = 0) -> Surfaces:
     """
     rng = np.random.default_rng(_WORLD_SEED)
     standing = (*_walls(rng), *_posters(rng), *_furniture(rng))
-    return Surfaces(standing, _circling(moving, rng) if moving else None)
+    circling = _circling(moving, rng) if moving else lambda t_s: ()
+    return lambda t_s: standing + circling(t_s)
 
 
 # The furniture ------------------------------------------------------------------------------------------------------
@@ -112,12 +106,16 @@ def _on_wall(axis: int, far: bool, corner_m: Array, size_m: Array, rng: np.rando
     origin = corner_m + far * size_m * np.eye(3)[axis]
     if far:  # x, y and z stay right-handed
         x, y, edges_m = y, x, edges_m[::-1]
-    shade = _SHADES[axis] if inwards > 0.0 else _SHADES[3 + axis]
-    return _painted(se3(np.stack([x, y, z], axis=1), origin), edges_m, shade, rng)
+    return _painted((x, y, z), origin, edges_m, rng)
 
 
-def _painted(T_world_panel: Array, size_m: tuple[float, float], shade: float, rng: np.random.Generator) -> Panel:
+def _painted(
+    axes: tuple[Array, Array, Array], origin: Array, size_m: tuple[float, float], rng: np.random.Generator
+) -> Panel:
+    """Return a panel with axes x, y and z along axes of the world, with a texture and the shade of where it looks."""
     offset_m = rng.uniform(0.0, TEXELS * TEXEL_M, 2).tolist()
+    shade = _SHADES[int(np.argmax(np.concatenate([axes[2], -axes[2]])))]
+    T_world_panel = se3(np.stack(axes, axis=1), origin)
     return Panel(T_world_panel, size_m, int(rng.integers(_TEXTURES)), (offset_m[0], offset_m[1]), shade)
 
 
@@ -143,8 +141,7 @@ def box(size_m: Array, rng: np.random.Generator) -> tuple[Panel, ...]:
             y = np.cross(z, x)
             edges_m = float(size_m[(axis + 1) % 3]), float(size_m[(axis + 2) % 3])
             origin = 0.5 * (z * size_m[axis] - x * edges_m[0] - y * edges_m[1])
-            shade = _SHADES[axis if sign > 0.0 else 3 + axis]
-            faces.append(_painted(se3(np.stack([x, y, z], axis=1), origin), edges_m, shade, rng))
+            faces.append(_painted((x, y, z), origin, edges_m, rng))
     return tuple(faces)
 
 
@@ -424,11 +421,3 @@ def developed(light: Floats, exposure: float, rng: np.random.Generator) -> Grey:
     sigma = np.sqrt(np.float32(_DARK_SIGMA**2) + np.float32(_VARIANCE_PER_GREY) * sharp)
     noisy = sharp + sigma * rng.standard_normal(sharp.shape, dtype=np.float32)
     return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
-
-
-def exposed(shot: Callable[[float], Floats], t_s: float, exposure_s: float, shots: int) -> Floats:
-    """Return the mean light over an exposure about a time, from ``shots`` instants: motion blur."""
-    if exposure_s == 0.0:
-        return shot(t_s)
-    times_s = t_s + exposure_s * ((np.arange(shots) + 0.5) / shots - 0.5)
-    return np.asarray(np.mean([shot(float(t)) for t in times_s], axis=0), dtype=np.float32)
