@@ -95,31 +95,27 @@ class JointEkf:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._outliers = setup.settings.outliers
         self._motion = setup.motion
-        self._joint = belief(self._motion.initial_belief(setup.prior))
+        self.joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
 
-    @property
-    def joint(self) -> JointBelief:
-        return self._joint
-
     def step(self, packet: Packet) -> Estimate:
-        propagate(self._joint, self._motion, self._at, packet.motion)
-        self._joint.clone()
+        propagate(self.joint, self._motion, self._at, packet.motion)
+        self.joint.clone()
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
-        forget_lost(self._joint, packet.frame, self._memory)
-        forget(self._joint, self._at.outdated(self._joint), self._memory)
-        self._correct(self._joint, packet.frame, self._at, self._rig, gate)
+        forget_lost(self.joint, packet.frame, self._memory)
+        forget(self.joint, self._at.outdated(self.joint), self._memory)
+        self._correct(self.joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)
-        self._joint.forget_clones(1)
-        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
+        self.joint.forget_clones(1)
+        return self.joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
-        self._memory.remember(self._joint.landmark_ids, self._joint.points)
+        self._memory.remember(self.joint.landmark_ids, self.joint.points)
         return self._memory.landmarks()
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start landmarks for the frame's tracks that are not in the state, by the stereo point of this one view."""
-        joint, rig = self._joint, self._rig
+        joint, rig = self.joint, self._rig
         new = frame.select(~is_among(frame.track_ids, joint.landmark_ids))
         near = stereo.disparity_px(new.uvs_px) > LEAST_DISPARITY_PX
         new = new.select(near & (rig.fx_px * rig.baseline_m > LEAST_DEPTH_M * stereo.disparity_px(new.uvs_px)))

@@ -35,7 +35,6 @@ from toolkit.models.stereo_adjustment import (
     Evaluated,
     ReducedVision,
     RobustCamera,
-    Sightings,
     StereoWindow,
     check_error,
     lower_factor,
@@ -383,17 +382,7 @@ class SlidingWindow:
         window, tied = self._window, self._tied()
         seen, by_oldest = window.sightings, window.sightings.pose == 0
         rows = np.concatenate([tied, np.setdiff1d(seen.point[by_oldest], tied)])
-        place = np.empty(len(window.points), dtype=np.int64)
-        place[rows] = np.arange(len(rows))
-        sightings = Sightings(seen.pose[by_oldest], place[seen.point[by_oldest]], seen.uv_px[by_oldest])
-        leaving = replace(
-            window,
-            keys=window.keys[:2],
-            motion=window.motion[:2],
-            points=window.points[rows],
-            track_ids=window.track_ids[rows],
-            sightings=sightings,
-        )
+        leaving = replace(window.with_points(rows, by_oldest), keys=window.keys[:2], motion=window.motion[:2])
         tried = Tried.of(leaving, self._camera, self._left, np.arange(len(tied)))
         equations = Equations.of(tried, self._left, np.arange(len(rows)))
         d, gone = window.size, np.isin(leaving.track_ids, list(unseen))
@@ -401,16 +390,7 @@ class SlidingWindow:
         information, vector = self._kept(*_without(equations.information, equations.vector, leave), d)
         old, new = leaving.poses
         self._coordinates.pass_on(se3_inverse(new) @ old, leaving.track_ids[~gone])
-        values = gtsam.Values(window.values)
-        for key in window.keys[0]:
-            values.erase(key)
-        self._window = replace(
-            window,
-            keys=window.keys[1:],
-            values=values,
-            motion=(gtsam.NonlinearFactorGraph(), *window.motion[2:]),
-            sightings=Sightings(seen.pose[~by_oldest] - 1, seen.point[~by_oldest], seen.uv_px[~by_oldest]),
-        )
+        self._window = window.later(1)
         at = Place.of(self._window, leaving.points[~gone])
         _, H = self._coordinates.errors(at, at)
         self._left = Gaussian(leaving.track_ids[~gone], at, *H.inverse().carry(information, vector), self._coordinates)
@@ -418,12 +398,8 @@ class SlidingWindow:
 
     def _forget(self, track_ids: Collection[int]) -> None:
         """Remove landmarks and their sightings."""
-        window, seen = self._window, self._window.sightings
-        kept = ~np.isin(window.track_ids, list(track_ids))
-        of_kept, place = kept[seen.point], np.cumsum(kept) - 1
-        sightings = Sightings(seen.pose[of_kept], place[seen.point[of_kept]], seen.uv_px[of_kept])
-        points, ids = window.points[kept], window.track_ids[kept]
-        self._window = replace(window, points=points, track_ids=ids, sightings=sightings)
+        kept = ~np.isin(self._window.track_ids, list(track_ids))
+        self._window = self._window.with_points(np.flatnonzero(kept), kept[self._window.sightings.point])
         for i in track_ids:
             self._last_seen_ns.pop(i, None)
 

@@ -587,17 +587,6 @@ def eliminate_tracks(
     return points, reliable, nis, dof, worst, weights, (N, E, e, D, d)
 
 
-@compiled
-def start_landmark(sightings: Arrays, points: Array, f: int, where: IntArray, here: Arrays, least_px: float) -> None:
-    """Write a first guess of track f's landmark to ``points[f]`` if there is none, which is NaN."""
-    uvs_px, seen = sightings
-    T_cam_world, camera = here
-    if math.isnan(points[f, 0]):
-        m = sighted(seen, f, where)
-        if m < 2 or not start_point(points, f, uvs_px, where, m, T_cam_world, camera, least_px)[0]:
-            points[f, 0] = np.nan
-
-
 _TRACKS = types.Tuple((_STACK, _MASK, _MATRIX, _MATRIX))
 
 
@@ -628,7 +617,10 @@ def normals_in_view(
     D, d = np.zeros((longest, 6, 6)), np.zeros(6 * longest)
     where, A, J = np.empty(longest, dtype=np.int64), np.empty((3 * longest, 4)), np.empty((3 * longest, 6))
     for f in range(count):
-        start_landmark((uvs_px, seen), points, f, where, (T_cam_world, camera), least_px)
+        if math.isnan(points[f, 0]):
+            m = sighted(seen, f, where)
+            if m < 2 or not start_point(points, f, uvs_px, where, m, T_cam_world, camera, least_px)[0]:
+                points[f, 0] = np.nan
         if math.isnan(points[f, 0]) or not seen[f, longest - 1]:
             continue
         m, left_only = sighted(weights, f, where), False

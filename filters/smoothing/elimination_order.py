@@ -9,7 +9,7 @@ that the two orders may differ.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import combinations
 
 import gtsam
@@ -34,7 +34,7 @@ def cheaper_order(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame])
     if max((count for _, count, _ in _landmarks(frames)), default=0) <= _FEWEST_STANDING:
         return by_colamd
     graph = _symbolic(motion, frames)
-    colamd, along = gtsam.Ordering.ColamdSymbolicFactorGraph(graph), _in_time(_all_keys(graph), frames)
+    colamd, along = gtsam.Ordering.ColamdSymbolicFactorGraph(graph), in_time(graph, frames)
     return in_time if _operations(graph, along) < _operations(graph, colamd) else by_colamd
 
 
@@ -42,15 +42,11 @@ def by_colamd(graph: gtsam.NonlinearFactorGraph, _frames: list[StereoFrame]) -> 
     return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
 
 
-def in_time(graph: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.Ordering:
+def in_time(graph: gtsam.NonlinearFactorGraph | gtsam.SymbolicFactorGraph, frames: list[StereoFrame]) -> gtsam.Ordering:
     """Return landmarks first, then states in time, each followed by the landmarks last seen from it, the rest last."""
-    return _in_time(graph.keyVector(), frames)
-
-
-def _in_time(keys: Iterable[int], frames: list[StereoFrame]) -> gtsam.Ordering:
     wait = {L(track_id): last for track_id, count, last in _landmarks(frames) if count > _MOST_TIED}
     first, of_states, rest = list[int](), defaultdict[int, list[int]](list), list[int]()
-    for key in sorted(keys):  # landmarks come before poses and velocities
+    for key in sorted(graph.keys()):  # landmarks come before poses and velocities
         kind = kind_of(key)
         if kind == "l" and key not in wait:
             first.append(key)
@@ -91,8 +87,3 @@ def _symbolic(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> 
         for track_id in frame.track_ids.tolist():
             graph.push_factor(X(k), L(track_id))
     return graph
-
-
-def _all_keys(graph: gtsam.SymbolicFactorGraph) -> list[int]:
-    ordering = gtsam.Ordering.NaturalSymbolicFactorGraph(graph)
-    return [ordering.at(i) for i in range(ordering.size())]

@@ -52,8 +52,6 @@ def refuses_much(accepted_percent: float) -> bool:
 
 def _accepted_percent(evaluation: Evaluation) -> float:
     info = evaluation.run.info
-    if evaluation.output != "causal" or evaluation.run.causal is None:
-        raise Unavailable(INNOVATIONS_ARE_CAUSAL)
     if not {"gate_tested", "gate_accepted"} <= info.keys():
         raise Unavailable("the estimator reports no gate")
     tested = float(np.nansum(info["gate_tested"]))

@@ -310,12 +310,26 @@ class StereoWindow:
         taken = self.track_ids[self.sightings.point[self.sightings.pose == len(self.keys) - 1]]
         return frame.select(np.isin(frame.track_ids, taken))
 
+    def with_points(self, rows: IntArray, kept: BoolArray) -> "StereoWindow":
+        """Return the window with the points of some rows (m,), and with sightings of these alone, a mask (N,)."""
+        seen, place = self.sightings, np.empty(len(self.points), dtype=np.int64)
+        place[rows] = np.arange(len(rows))
+        left = Sightings(seen.pose[kept], place[seen.point[kept]], seen.uv_px[kept])
+        return replace(self, points=self.points[rows], track_ids=self.track_ids[rows], sightings=left)
+
     def with_sightings(self, kept: BoolArray) -> "StereoWindow":
         """Return the window with some of its sightings, a mask (N,), and without points that have none."""
-        seen = self.sightings
-        points, rows = np.unique(seen.point[kept], return_inverse=True)
-        left = Sightings(seen.pose[kept], rows.astype(np.int64), seen.uv_px[kept])
-        return replace(self, points=self.points[points], track_ids=self.track_ids[points], sightings=left)
+        return self.with_points(np.unique(self.sightings.point[kept]), kept)
+
+    def later(self, count: int) -> "StereoWindow":
+        """Return the window without its ``count`` oldest states, their sightings, and all factors that tie them."""
+        values, seen = gtsam.Values(self.values), self.sightings
+        for key in (key for keys in self.keys[:count] for key in keys):
+            values.erase(key)
+        stay = seen.pose >= count
+        left = Sightings(seen.pose[stay] - count, seen.point[stay], seen.uv_px[stay])
+        motion = gtsam.NonlinearFactorGraph(), *self.motion[count + 1 :]
+        return replace(self, keys=self.keys[count:], values=values, motion=motion, sightings=left)
 
     def in_front(self, rig: StereoRig) -> tuple["StereoWindow", IntArray]:
         """Drop the points that are behind a camera that saw them; return the window and the ids (n,) of these."""
@@ -507,17 +521,8 @@ def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> St
     leaving = replace(window.with_sightings(is_leaving), motion=window.motion[: count + 1])
     system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
     information, vector, _ = without(system.information, system.vector, gone)
-    left, values = window.with_sightings(~is_leaving), gtsam.Values(window.values)
-    for key in (key for keys in window.keys[:count] for key in keys):
-        values.erase(key)
-    return replace(
-        left,
-        keys=window.keys[count:],
-        values=values,
-        motion=(gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :]),
-        prior=MarginalPrior(information, vector, values),
-        sightings=replace(left.sightings, pose=left.sightings.pose - count),
-    )
+    left = window.with_sightings(~is_leaving).later(count)
+    return replace(left, prior=MarginalPrior(information, vector, left.values))
 
 
 def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> tuple[Evaluated, float, float]:
