@@ -6,12 +6,13 @@ states does not bind, the estimator gets every frame.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.measurements import ImuMotion, Motion, Packet, TwistMotion, UnmeasuredMotion, noise_scale_of
+from toolkit.measurements import Motion, Packet, UnmeasuredMotion, noise_scale_of
 from toolkit.models.state import predicted
 
 
@@ -58,18 +59,14 @@ class Thinned:
 
 
 def _concatenated(first: Motion | None, second: Motion | None) -> Motion | None:
-    """Concatenate two successive motions; where one is None, return the other."""
+    """Concatenate two successive motions of one kind; where one is None, return the other."""
     if first is None or second is None:
         return second if first is None else first
-    durations = np.concatenate([first.dt_s, second.dt_s])
     if isinstance(first, UnmeasuredMotion) or isinstance(second, UnmeasuredMotion):
-        return UnmeasuredMotion(durations.sum(keepdims=True))
+        return UnmeasuredMotion(np.concatenate([first.dt_s, second.dt_s]).sum(keepdims=True))
     scale = None
     if first.noise_scale is not None or second.noise_scale is not None:
         scale = np.concatenate([noise_scale_of(first), noise_scale_of(second)])
-    if isinstance(first, ImuMotion) and isinstance(second, ImuMotion):
-        accel = np.concatenate([first.accel_mps2, second.accel_mps2])
-        return ImuMotion(durations, accel, np.concatenate([first.gyro_radps, second.gyro_radps]), scale)
-    assert isinstance(first, TwistMotion) and isinstance(second, TwistMotion)
-    velocity = np.concatenate([first.v_mps, second.v_mps])
-    return TwistMotion(durations, velocity, np.concatenate([first.w_radps, second.w_radps]), scale)
+    sampled = [name for name in vars(first) if name != "noise_scale"]
+    joined: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in sampled}
+    return replace(first, **joined, noise_scale=scale)

@@ -1,4 +1,4 @@
-"""Smoothers whose lag is longer than the recording are the batch."""
+"""Smoothers whose lag is longer than the recording, or without end, are the batch."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 
 from filters import batch, ekf
 from filters.fixed_lag import FixedLag
+from filters.isam2 import Isam2
 from filters.smart import Smart
 from tests.filters.conftest import recorded
 from toolkit.geometry import se3_inverse, se3_log
@@ -21,7 +22,7 @@ def largest_difference(one, other) -> float:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-@pytest.mark.parametrize("kind", [FixedLag, Smart])
+@pytest.mark.parametrize("kind", [FixedLag, Smart, lambda setup, _: Isam2(setup)], ids=["fixed-lag", "smart", "isam2"])
 def test_an_infinite_lag_is_the_batch(kind, scenario):
     """Held equal: packets, prior, stated noise, the motion's and the stereo factors, the gate that lets all pass.
 

@@ -78,16 +78,6 @@ class _Fit(NamedTuple):
     after_m: float
 
 
-class _Linearised(NamedTuple):
-    """Of n pairs the aligned positions less the true ones (n, 3) m, and their Jacobian (n, 3, 7).
-
-    Its columns are the true velocity (m/s), a turn about each axis of the world and a displacement along each.
-    """
-
-    error_m: Array
-    jacobian: Array
-
-
 def score(evaluation: AgainstTruth) -> Scores:
     try:
         fit = _fit(evaluation.compared, with_rate=False)
@@ -124,13 +114,13 @@ def _fit(pairs: Matched, with_rate: bool) -> _Fit:
             rows &= (at_s >= t_s[0]) & (at_s <= t_s[-1])
             if rows.sum() < _FEWEST_PAIRS:
                 break
-            at = _linearised(path, at_s[rows], estimated[rows])
-            step = _clock_step(*at, since_s[rows])
+            error_m, jacobian = _linearised(path, at_s[rows], estimated[rows])
+            step = _clock_step(error_m, jacobian, since_s[rows])
             clock += step
             if share == 1.0 and abs(step[0]) < _SETTLED_S:
-                before_m = rmse(lengths(_linearised(path, t_s[rows], estimated[rows]).error_m))
-                errors = np.sqrt(np.diag(jackknife_cov(_clock_step, *at, since_s[rows])))
-                return _Fit(clock, errors, before_m, rmse(lengths(at.error_m)))
+                before_m = rmse(lengths(_linearised(path, t_s[rows], estimated[rows])[0]))
+                errors = np.sqrt(np.diag(jackknife_cov(_clock_step, error_m, jacobian, since_s[rows])))
+                return _Fit(clock, errors, before_m, rmse(lengths(error_m)))
     raise Unavailable("no offset within the recording makes the positions fit")
 
 
@@ -187,14 +177,18 @@ def _of_rate(evaluation: AgainstTruth, by_offset_m: float) -> str:
     return _RATE_REMARK.format(1.0 / (1.0 + slower), error, fit.after_m, fit.before_m)
 
 
-def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Linearised:
-    """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise the remaining errors."""
+def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> tuple[Array, Array]:
+    """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise the remaining errors.
+
+    Return the aligned less the true ones (n, 3) m and their Jacobian (n, 3, 7): to the time (the true velocity, m/s), a
+    turn about each axis of the world and a displacement along each.
+    """
     true, velocity = path(t_s), path(t_s, 1)
     alignment = fit_se3(true, estimated)
     aligned = estimated @ alignment.rotation.T + alignment.translation
     turned = -skew(aligned - aligned.mean(axis=0))
     moved = np.broadcast_to(np.eye(3), turned.shape)
-    return _Linearised(aligned - true, np.concatenate([velocity[:, :, None], turned, moved], axis=2))
+    return aligned - true, np.concatenate([velocity[:, :, None], turned, moved], axis=2)
 
 
 def _clock_step(error_m: Array, jacobian: Array, since_s: Array) -> Array:

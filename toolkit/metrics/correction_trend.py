@@ -18,7 +18,7 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
-from toolkit.models.corrections import Correction, CorrectionTest, PredictedSteps, predicted_steps
+from toolkit.models.corrections import Correction, PredictedSteps, predicted_steps
 from toolkit.models.state import Belief
 
 ORDER = 73
@@ -53,14 +53,14 @@ METRICS = (
 
 def score(evaluation: Evaluation) -> Scores:
     """Score the corrections of a causal output; raise Unavailable where there are none to test."""
-    tests = [test for test in _tests(evaluation) if test.dof]
+    tests = [(nis, dof) for nis, dof in _tests(evaluation) if dof]
     if not tests:
         raise Unavailable(NOTHING_CORRECTED)
     nis, dof = np.sum(tests, axis=0)
     return Scores({TREND: float(nis / dof), LIMIT: _BY_LINEARISATION * float(chdtri(dof, _BY_CHANCE) / dof)})
 
 
-def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
+def _tests(evaluation: Evaluation) -> Iterator[tuple[float, int]]:
     """Yield the test of the summed corrections of each whole stretch."""
     steps = predicted_steps(evaluation.estimate, evaluation.sequence)
     if steps is None:

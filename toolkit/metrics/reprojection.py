@@ -10,8 +10,6 @@ jump back and forth by more than they gain, whatever its covariance. The motion 
 first state. Errors are paired over the tracks, which differ far more from each other than two estimates of one do.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from toolkit.answers import Run
@@ -136,29 +134,25 @@ def held_out_errors(evaluation: Evaluation) -> Array:
     return errors_px
 
 
-class _Paired(NamedTuple):
-    """For n tracks the logarithm (n,) of the ratio of two errors, and the mean time (n,) s of their sightings."""
-
-    log_ratio: Array
-    t_s: Array
-
-
 def _over_motion(evaluation: Evaluation) -> Scores:
     """Score the ratio of the errors of withheld tracks under the evaluated poses to those under the motion alone.
 
     If vision did harm, a remark on the ratio says so, and in which stretch most.
     """
-    paired = _paired(evaluation)
-    ratio, error = _mean(paired.log_ratio)
-    harm = _harm(paired, evaluation.sequence.motion_kind)
+    log_ratio, t_s = _paired(evaluation)
+    ratio, error = _mean(log_ratio)
+    harm = _harm(log_ratio, t_s, evaluation.sequence.motion_kind)
     if harm:
         harm += _OF_CAUSAL if evaluation.output == "causal" else _OF_FINAL
     scores = Scores({RATIO: float(np.exp(ratio)), ERROR: error})
     return scores.remarked((RATIO,), harm)
 
 
-def _paired(evaluation: Evaluation) -> _Paired:
-    """Return the ratios of the errors of withheld tracks to those under the measured motion alone."""
+def _paired(evaluation: Evaluation) -> tuple[Array, Array]:
+    """Return the errors of n withheld tracks over those under the measured motion alone, as logarithms (n,).
+
+    With them the mean times (n,) s of the tracks' sightings.
+    """
     sequence = evaluation.sequence
     motion = _motion_alone(evaluation.estimate, sequence)
     seen, errors_px = evaluation.held_out_errors
@@ -175,7 +169,7 @@ def _paired(evaluation: Evaluation) -> _Paired:
         )
     apart = 0.5 * np.log((errors_px**2 + _FLOOR_PX**2) / (by_motion_px**2 + _FLOOR_PX**2))
     t_s = sequence.frames_s[tracks.frame]
-    return _Paired(np.bincount(track, apart) / count, np.bincount(track, t_s) / count)
+    return np.bincount(track, apart) / count, np.bincount(track, t_s) / count
 
 
 def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
@@ -197,16 +191,16 @@ def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
     return Run("the measured motion", "ok", motion, None, Landmarks.none(), timings=None)
 
 
-def _harm(paired: _Paired, kind: str) -> str:
+def _harm(log_ratio: Array, t_s: Array, kind: str) -> str:
     """Return by how much, and in which stretch most, vision did harm; empty if it did not."""
-    whole, notes = _mean(paired.log_ratio), list[str]()
+    whole, notes = _mean(log_ratio), list[str]()
     if _least(whole) > np.log(MOST_RATIO[kind]):
         ratio = float(np.exp(whole[0]))
-        notes.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times ({paired.t_s.size} tracks)")
-    edges = np.linspace(paired.t_s.min(), paired.t_s.max(), _STRETCHES + 1)
-    stretch = np.clip(np.searchsorted(edges, paired.t_s, side="right") - 1, 0, _STRETCHES - 1)
+        notes.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times ({t_s.size} tracks)")
+    edges = np.linspace(t_s.min(), t_s.max(), _STRETCHES + 1)
+    stretch = np.clip(np.searchsorted(edges, t_s, side="right") - 1, 0, _STRETCHES - 1)
     many = [k for k in range(_STRETCHES) if np.count_nonzero(stretch == k) >= _FEWEST_IN_STRETCH]
-    of_stretch = {k: _mean(paired.log_ratio[stretch == k]) for k in many}
+    of_stretch = {k: _mean(log_ratio[stretch == k]) for k in many}
     worst = max(many, key=lambda k: _least(of_stretch[k]), default=None)
     if worst is not None and _least(of_stretch[worst]) > np.log(MOST_RATIO_OF_STRETCH[kind]):
         notes.append(f"{np.exp(of_stretch[worst][0]):.2g} times at {edges[worst]:.0f}-{edges[worst + 1]:.0f} s")

@@ -27,13 +27,6 @@ from toolkit.sequence import Sequence
 LEAST_TAKEN = 1e-3
 
 
-class CorrectionTest(NamedTuple):
-    """The squared Mahalanobis length of a correction; its degrees of freedom are the directions that were corrected."""
-
-    nis: float
-    dof: int
-
-
 @dataclass(frozen=True, eq=False)
 class Correction:
     """The error (d,) by which a state was moved, or the sum of several, and the reduction (d, d) of its covariance."""
@@ -46,14 +39,17 @@ class Correction:
         """Return the correction from the belief before the measurements to the one after."""
         return cls(before.error_to(after), before.cov - after.cov)
 
-    def test(self, sigma: Array) -> CorrectionTest:
-        """Test the correction, its entries in units of ``sigma`` (d,); an entry whose sigma is zero is left out."""
+    def test(self, sigma: Array) -> tuple[float, int]:
+        """Return the squared Mahalanobis length of the correction and how many directions were corrected.
+
+        Entries are in units of ``sigma`` (d,); an entry whose sigma is zero is left out.
+        """
         per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
         shares, axes = np.linalg.eigh(per_sigma[:, None] * self.taken * per_sigma)
         # Relinearisation may increase a variance. Directions whose reduction is smaller than that are not tested.
         observed = shares > max(LEAST_TAKEN, -shares[0])
         length = axes[:, observed].T @ (per_sigma * self.moved)
-        return CorrectionTest(float((length**2 / shares[observed]).sum()), int(observed.sum()))
+        return float((length**2 / shares[observed]).sum()), int(observed.sum())
 
 
 def belief_at(trajectory: Trajectory, rows: int | IntArray, model: MotionModel) -> Belief:

@@ -18,11 +18,12 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3, so3_exp
 from toolkit.measurements import GRAVITY_WORLD, NS_PER_S, ImuNoise, Prior, StereoRig, TwistNoise
+from toolkit.motion_samples import MotionSamples
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors
 from toolkit.simulation.scenes import Kinematics, Scene, SceneOf, SmoothTrajectory, hall, road
-from toolkit.simulation.sensors import CameraLimits, Imu, MotionMeasurements, Odometer, TrackNoise
+from toolkit.simulation.sensors import CameraLimits, Imu, Odometer, TrackNoise
 
 START_NS = 1_600_000_000 * NS_PER_S
 # The measurements of an hour take a gigabyte.
@@ -89,18 +90,18 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
     parts = scenario.scene, scenario.duration_s, scenario.rig, scenario.camera
     view = _view(*parts, world_rng) if scenario.varied else _view_of_all_seeds(*parts)
     frames_t_ns, motion = view.frames_t_ns, view.motion
-    measured = _measure_motion(scenario, view.scene.trajectory, frames_t_ns, motion_rng)
-    last_sample = np.searchsorted(measured.samples.t_ns, frames_t_ns, side="right") - 1
+    samples, bias = _measure_motion(scenario, view.scene.trajectory, frames_t_ns, motion_rng)
+    last_sample = np.searchsorted(samples.t_ns, frames_t_ns, side="right") - 1
     return Sequence(
         name=scenario.name,
         rig=scenario.rig,
         noise=scenario.motion.noise,
         frames_t_ns=frames_t_ns,
         observations=_observe(scenario, view, [*track_rngs, slips_rng]),
-        motion=measured.samples,
+        motion=samples,
         provenance=_provenance(scenario, seed),
         prior=_prior(scenario, motion, prior_rng),
-        truth=Truth(frames_t_ns, motion.T_world_imu, motion.v_world, measured.bias[last_sample]),
+        truth=Truth(frames_t_ns, motion.T_world_imu, motion.v_world, bias[last_sample]),
         gravity_world=scenario.gravity_world,
     )
 
@@ -129,7 +130,7 @@ _view_of_all_seeds = lru_cache(maxsize=2)(_view)
 
 def _measure_motion(
     scenario: Scenario, trajectory: SmoothTrajectory, frames_t_ns: IntArray, rng: np.random.Generator
-) -> MotionMeasurements:
+) -> tuple[MotionSamples, Array]:
     sensor, scale = scenario.motion, scenario.noise_scale
     if isinstance(sensor, Imu):
         t_ns = sensors.imu_stamps_ns(START_NS, sensor.rate_hz, scenario.duration_s)

@@ -83,14 +83,6 @@ class Imu:
     bias_sigma: Array
 
 
-@dataclass(frozen=True, eq=False)
-class MotionMeasurements:
-    """Motion samples and the bias (S, 6), [accel, gyro], contained in each of them."""
-
-    samples: MotionSamples
-    bias: Array
-
-
 def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
     """Return the stamps (S,) ns of a periodic sensor from the start to the end of a recording, both included."""
     count = int(np.floor(duration_s * rate_hz + 1e-9)) + 1
@@ -235,10 +227,11 @@ def while_in_image(seen: Observations, size_px: tuple[int, int]) -> Observations
 
 def measure_twist(
     odometer: Odometer, scale: float, t_ns: IntArray, T_world_imu: Array, rng: np.random.Generator
-) -> MotionMeasurements:
+) -> tuple[MotionSamples, Array]:
     """Measure the exact mean body twist of each interval between stamps: log(T_k^-1 T_k+1) / dt, plus noise.
 
-    Takes stamps (S + 1,) and poses (S + 1, 4, 4) and returns S samples; sample k is the motion from k to k + 1.
+    Takes stamps (S + 1,) and poses (S + 1, 4, 4). Returns S samples, of which k is the motion from k to k + 1, and the
+    biases (S, 6), [accel, gyro], contained in them.
     """
     dt_s = np.diff(t_ns)[:, None] / NS_PER_S
     exact = se3_log(se3_inverse(T_world_imu[:-1]) @ T_world_imu[1:]) / dt_s
@@ -250,15 +243,15 @@ def measure_twist(
     density = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density])
     measured = exact + scale * white * density / np.sqrt(dt_s)
     samples = TwistSamples(t_ns[:-1], measured[:, 3:], measured[:, :3] + gyro_bias, "start")
-    return MotionMeasurements(samples, np.hstack([np.zeros_like(gyro_bias), gyro_bias]))
+    return samples, np.hstack([np.zeros_like(gyro_bias), gyro_bias])
 
 
 def measure_imu(
     imu: Imu, scale: float, t_ns: IntArray, motion: Kinematics, gravity: Array, rng: np.random.Generator
-) -> MotionMeasurements:
+) -> tuple[MotionSamples, Array]:
     """Measure the instantaneous specific force and angular velocity at stamps (S,), plus noise and bias.
 
-    ``motion`` is the exact one there, ``gravity`` (3,) m/s^2 that of the world.
+    ``motion`` is the exact one there, ``gravity`` (3,) m/s^2 that of the world. Returns also the biases (S, 6).
     """
     dt_s = 1.0 / imu.rate_hz
     R_imu_world = np.swapaxes(motion.T_world_imu[:, :3, :3], 1, 2)
@@ -270,7 +263,7 @@ def measure_imu(
     walk_density = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3)
     bias = scale * _walk(imu.bias_sigma * start_rng.standard_normal(6), walk_density * np.sqrt(dt_s) * walk)
     measured = exact + bias + scale * white * density / np.sqrt(dt_s)
-    return MotionMeasurements(ImuSamples(t_ns, measured[:, :3], measured[:, 3:], "middle"), bias)
+    return ImuSamples(t_ns, measured[:, :3], measured[:, 3:], "middle"), bias
 
 
 def _walk(start: Array, steps: Array) -> Array:
