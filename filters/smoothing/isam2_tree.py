@@ -268,7 +268,12 @@ class Isam2Tree:
 
     def read(self, keys: list[int]) -> gtsam.Values:
         """Return the latest values of states by their keys, without copying the other values."""
-        return self._motion.latest(self.isam, keys)
+        of_vector, of_bias = self.isam.calculateEstimateVector, self.isam.calculateEstimateConstantBias
+        bias = of_vector if self._motion.layout.accel_bias is None else of_bias
+        readers, values = {"x": self.isam.calculateEstimatePose3, "v": of_vector, "b": bias}, gtsam.Values()
+        for key in keys:
+            values.insert(key, readers[kind_of(key)](key))
+        return values
 
     def points(self, landmarks: Iterable[int]) -> Array:
         """Return the latest points (N, 3) m of landmarks in the world."""

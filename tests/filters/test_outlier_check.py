@@ -174,6 +174,14 @@ def test_landmarks_that_began_with_an_outlier_do_not_put_the_state_in_doubt():
     assert found[23:].mean() < 0.1
 
 
+@pytest.mark.parametrize(("share", "believed"), [(0.4, True), (0.6, False)])
+def test_where_most_confirmed_tracks_disagree_the_state_is_wrong_and_none_is_an_outlier(share, believed):
+    frame, points = frame_and_points(np.tile([15.0, 15.0, -15.0], (round(share * 40), 1)))
+    landmarks = known_from_origin(points)
+    landmarks.see(frame, points, np.eye(4))  # a second time
+    assert outliers(frame, landmarks, state_at(np.eye(4))).any() == believed
+
+
 POSES = [se3_exp(np.array([0.0, 0.01 * k, 0.0, 0.3 * k, 0.0, 0.0])) for k in range(12)]
 
 

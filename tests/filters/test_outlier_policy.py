@@ -133,22 +133,6 @@ def test_windowed_filters_weigh_a_sighting_in_view_and_later_its_track_by_the_co
         assert pulled[6.0] < NOTHING_M
 
 
-@pytest.mark.parametrize(("share", "believed"), [(0.4, False), (0.6, True)])
-@pytest.mark.parametrize("name", ["fixed-lag", "isam2"])
-def test_where_most_tracks_disagree_none_is_an_outlier(scene, run_estimator, name, share, believed):
-    """Tracks slip one by one; where more than half disagree it is the state that is doubted."""
-    seen, rng = scene.sequence.observations, np.random.default_rng(0)
-    rows = np.flatnonzero((seen.frame == FRAME) & ~is_held_out(seen.track_id))
-    # Tracks that the frame before shows as well: a new one has nothing to have slipped from.
-    known = rows[np.isin(seen.track_id[rows], seen.track_id[seen.frame == FRAME - 1])]
-    struck = rng.permutation(known)[: round(share * known.size)]
-    uv_px = seen.uv_px.copy()
-    uv_px[struck, :] += 15.0 * rng.choice([-1.0, 1.0], (struck.size, 1)) * np.array([1.0, 1.0, 1.0])
-    struck_scene = replace(scene.sequence, observations=replace(seen, uv_px=uv_px))
-    run = run_estimator(name, struck_scene, settings=Settings(outliers=POLICIES["classic"]))
-    assert (scene.error_m(run) > 100.0 * NOTHING_M) == believed
-
-
 def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_jumped_is_tested_again(scene, run_estimator):
     """To give up the worst sighting of a track with bad luck would choose measurements by their agreement.
 

@@ -10,7 +10,7 @@ import numpy as np
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.measurements import Motion, Prior
-from toolkit.models.factors import B, EliminatedGraph, V, X, constant_bias, joint_cov, joint_prior, kind_of
+from toolkit.models.factors import B, EliminatedGraph, V, X, constant_bias, joint_cov, joint_prior
 from toolkit.models.state import Belief, Increment, Layout, Prediction, with_velocity_turned
 
 
@@ -68,15 +68,6 @@ class MotionModel(ABC):
             bias = values.atConstantBias(B(k)).vector()
         v_world = None if self.layout.velocity is None else values.atVector(V(k))
         return Estimate(t_ns, values.atPose3(X(k)).matrix(), v_world=v_world, bias=bias)
-
-    def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
-        """Return the latest values of some states' variables, without copying all others from the tree."""
-        of_vector, of_bias = tree.calculateEstimateVector, tree.calculateEstimateConstantBias
-        bias = of_vector if self.layout.accel_bias is None else of_bias
-        readers, values = {"x": tree.calculateEstimatePose3, "v": of_vector, "b": bias}, gtsam.Values()
-        for key in keys:
-            values.insert(key, readers[kind_of(key)](key))
-        return values
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
         """Return the prior on state k at a belief: one linear factor on all its variables."""
