@@ -21,12 +21,12 @@ from functools import partial
 
 import numpy as np
 
-from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InverseDepthBelief
 from filters.kalman.joint import (
     AtFirstEstimates,
     JointBelief,
     Linearisation,
+    correct_by_landmarks,
     forget,
     forget_lost,
     linearisation,
@@ -90,7 +90,7 @@ class JointEkf:
         setup: Setup,
         linearisation: Linearisation,
         belief: Callable[[Belief], JointBelief] = JointBelief,
-        correct: Correct = joint_landmarks.correct,
+        correct: Correct = correct_by_landmarks,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._outliers = setup.settings.outliers

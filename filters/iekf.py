@@ -23,10 +23,17 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from filters.ekf_slam import JointEkf
-from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief
-from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation
-from filters.kalman.joint_landmarks import LandmarkSightings
+from filters.kalman.joint import (
+    AtLatestEstimates,
+    JointBelief,
+    LandmarkSightings,
+    Linearisation,
+    covs_with_state,
+    innovation,
+    linearise_sightings,
+    weighed,
+)
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -74,8 +81,8 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """
     if not len(joint.landmark_ids):
         return
-    seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
-    weights = joint_landmarks.weighed(joint, seen, joint_landmarks.covs_with_state(joint, seen), gate)
+    seen = linearise_sightings(joint, frame, at, rig)
+    weights = weighed(joint, seen, covs_with_state(joint, seen), gate)
     if not weights.any():
         return
     measurement = Measurement(joint, frame, at, rig, weights)
@@ -83,8 +90,8 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     gate.unconverged += not converged
     if converged or best.pull.any():
         joint.move(best.delta)
-        cross_covs = joint_landmarks.covs_with_state(joint, best.seen)
-        joint.reduce_covariance(*joint_landmarks.innovation(joint, best.seen, cross_covs, weights)[:2])
+        cross_covs = covs_with_state(joint, best.seen)
+        joint.reduce_covariance(*innovation(joint, best.seen, cross_covs, weights)[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +112,7 @@ class Measurement:
     def after(self, pull: Array) -> Iterate:
         """Return the correction that a pull (k,) yields."""
         delta = self.prediction.cov[:, self.part] @ pull
-        seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        seen = linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[self.part] @ pull
         in_front = (seen.depth_m[self.weights > 0.0] > 0.0).all()
         cost = float(prior + self.weights @ np.square(seen.residuals).sum(axis=1)) if in_front else np.inf

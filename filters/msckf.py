@@ -13,8 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from filters.kalman import joint_landmarks
-from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, forget_lost, propagate
+from filters.kalman.joint import (
+    AtLatestEstimates,
+    JointBelief,
+    Linearisation,
+    correct_by_landmarks,
+    forget_lost,
+    propagate,
+)
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
 from filters.kalman.tracks import (
@@ -79,7 +85,7 @@ class Msckf:
         self._clone_t_ns.append(frame.t_ns)
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
         forget_lost(self._joint, frame, self._memory)
-        joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+        correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
         if len(self._joint.landmark_ids):
             frame = frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
         self._tracks.add_frame(frame)

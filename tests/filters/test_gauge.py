@@ -16,8 +16,7 @@ import pytest
 
 from filters import iekf
 from filters.ekf_slam import JointEkf
-from filters.kalman import joint_landmarks
-from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, Linearisation
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, Linearisation, correct_by_landmarks
 from filters.msckf import Msckf
 from tests.filters.conftest import BELIEFS, LOOSENESS, loosened, recorded, setup_of, short
 from tests.filters.conftest import gauge as directions
@@ -137,7 +136,7 @@ def most_information_gained(scenario, belief: str, correct) -> float:
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
-@pytest.mark.parametrize("correct", [joint_landmarks.correct, iekf.correct], ids=["single", "iterated"])
+@pytest.mark.parametrize("correct", [correct_by_landmarks, iekf.correct], ids=["single", "iterated"])
 def test_at_latest_estimates_none_is_gained_in_invariant_errors_but_in_plain_ones(scenario, correct) -> None:
     """Of the whole joint belief, landmarks included; after marginalising them less is left."""
     # The condition of a joint covariance is some 1e9: seven digits of the information are left.

@@ -14,9 +14,8 @@ import pytest
 
 from filters import iekf
 from filters.ekf_slam import JointEkf
-from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.joint import AtLatestEstimates, JointBelief, forget_lost, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, forget_lost, linearise_sightings, propagate
 from filters.kalman.online_output import LandmarkMemory
 from tests.filters.conftest import BELIEFS, setup_of, short
 from tests.models.conftest import numerical_jacobian
@@ -72,9 +71,9 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
         moved = joint.displaced(delta + np.r_[change[-6:], np.zeros(part.start - 6), change])
-        return measurement.stacked(joint_landmarks.linearise_sightings(moved, frame, AT, rig))[1]
+        return measurement.stacked(linearise_sightings(moved, frame, AT, rig))[1]
 
-    seen = joint_landmarks.linearise_sightings(joint.displaced(delta), frame, AT, rig)
+    seen = linearise_sightings(joint.displaced(delta), frame, AT, rig)
     H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
     H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
     expected = -numerical_jacobian(residuals, part.stop - part.start)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from filters import iekf
-from filters.kalman import joint_landmarks
-from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, correct_by_landmarks
 from tests.filters.conftest import with_clones
 from toolkit.geometry import transform
 from toolkit.measurements import StereoFrame
@@ -15,7 +14,7 @@ from toolkit.models import stereo
 from toolkit.models.gating import FrameGate
 from toolkit.simulation import FLIGHT
 
-CORRECT = {"single": joint_landmarks.correct, "iterated": iekf.correct}
+CORRECT = {"single": correct_by_landmarks, "iterated": iekf.correct}
 
 
 @pytest.mark.parametrize("correct", CORRECT.values(), ids=CORRECT)
@@ -65,7 +64,7 @@ def test_the_correction_is_the_kalman_update_by_all_sightings_that_count(at, lef
     H, sigmas = np.vstack(rows), np.sqrt(np.diag(P))
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
     expected, moved = P - gain @ H @ P, joint.displaced(gain @ np.concatenate(residuals))
-    joint_landmarks.correct(joint, StereoFrame(0, np.arange(count)[::-1], uvs_px[::-1]), at, rig, gate)
+    correct_by_landmarks(joint, StereoFrame(0, np.arange(count)[::-1], uvs_px[::-1]), at, rig, gate)
     assert 0 < gate.accepted < gate.tested - 1
     np.testing.assert_allclose(joint.cov / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-9)
     np.testing.assert_allclose(joint.clones, moved.clones, atol=1e-9)
