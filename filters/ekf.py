@@ -12,9 +12,9 @@ import numpy as np
 from filters.kalman.landmark_map import (
     LandmarkMap,
     TrackedMap,
-    carried,
-    correct_landmarks_below,
-    informed,
+    correct_gated_landmarks,
+    information_update,
+    projected_cov,
     residuals_with_jacobians,
 )
 from filters.kalman.online_output import Filter, OnlineOutput
@@ -63,7 +63,7 @@ class DecoupledEkf(Filter):
             # of their own decides.
             pose_cov = self._belief.cov[POSE, POSE]
             bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
-            seen = correct_landmarks_below(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
+            seen = correct_gated_landmarks(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
 
@@ -94,11 +94,11 @@ def correct_pose(
     noise_px2, dof = stereo.noise_px2(uvs_px, rig), stereo.degrees_of_freedom(uvs_px)
     landmark_px2 = H_point @ landmarks.covs @ transposed(H_point)
 
-    S = carried(H_pose, belief.cov[POSE, POSE]) + landmark_px2 + noise_px2
+    S = projected_cov(H_pose, belief.cov[POSE, POSE]) + landmark_px2 + noise_px2
     accepted = gate.accepts(mahalanobis_squared(residual_px, S), dof, depth_m > 0.0)
     weights = gate.weights(mahalanobis_squared(residual_px, landmark_px2 + noise_px2), dof, accepted)
 
     # The gain of all sightings at once in information form: sums of 3x3 blocks (see landmark_map).
     weighted = weights[:, None, None] * np.linalg.solve(landmark_px2 + noise_px2 / rig.track_weight, H_pose)
     rows = weighted.reshape(-1, 6)
-    return informed(belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)), accepted
+    return information_update(belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)), accepted

@@ -27,9 +27,9 @@ from filters.kalman.joint import (
     JointBelief,
     Linearisation,
     correct_by_landmarks,
-    forget,
-    forget_lost,
     linearisation,
+    marginalise,
+    marginalise_lost,
     propagate,
 )
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
@@ -102,11 +102,11 @@ class JointEkf:
         propagate(self.joint, self._motion, self._at, packet.motion)
         self.joint.clone()
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
-        forget_lost(self.joint, packet.frame, self._memory)
-        forget(self.joint, self._at.outdated(self.joint), self._memory)
+        marginalise_lost(self.joint, packet.frame, self._memory)
+        marginalise(self.joint, self._at.outdated(self.joint), self._memory)
         self._correct(self.joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)
-        self.joint.forget_clones(1)
+        self.joint.marginalise_clones(1)
         return self.joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:

@@ -18,7 +18,7 @@ from filters.kalman.joint import (
     JointBelief,
     Linearisation,
     correct_by_landmarks,
-    forget_lost,
+    marginalise_lost,
     propagate,
 )
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
@@ -84,7 +84,7 @@ class Msckf:
         self._joint.clone()
         self._clone_t_ns.append(frame.t_ns)
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
-        forget_lost(self._joint, frame, self._memory)
+        marginalise_lost(self._joint, frame, self._memory)
         correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
         if len(self._joint.landmark_ids):
             frame = frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
@@ -92,7 +92,7 @@ class Msckf:
         leaving = bisect_left(self._clone_t_ns, frame.t_ns - self._lag_ns)
         self._correct_by_tracks(leaving, gate)
         if leaving:
-            self._joint.forget_clones(leaving)
+            self._joint.marginalise_clones(leaving)
             self._tracks.drop_oldest(leaving)
             del self._clone_t_ns[:leaving]
         gate_in_view = FrameGate(outliers.gate_probability, outliers.joint_huber)

@@ -10,7 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, informed, residuals_with_jacobians
+from filters.kalman.landmark_map import (
+    LandmarkMap,
+    TrackedMap,
+    correct_landmarks,
+    information_update,
+    residuals_with_jacobians,
+)
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
@@ -55,7 +61,9 @@ class SeedEkf(Filter):
         residual_px, H_pose, *_ = residuals_with_jacobians(seen, uvs_px, self._belief.T_world_imu, self._rig)
         noise_px2 = stereo.noise_px2(uvs_px, self._rig) / self._rig.track_weight
         rows = np.asarray(np.linalg.solve(noise_px2, H_pose)).reshape(-1, 6)
-        self._belief = informed(self._belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1))
+        self._belief = information_update(
+            self._belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)
+        )
 
     def landmarks(self) -> Landmarks:
         return self._map.landmarks()

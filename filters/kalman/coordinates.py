@@ -38,8 +38,8 @@ class LandmarkAnchors(JointBelief):
         anchor = self.clones[-1] @ self._T_imu_cam
         self.anchors = np.concatenate([self.anchors, np.tile(anchor, (len(track_ids), 1, 1))])
 
-    def forget_landmarks(self, which: BoolArray) -> None:
-        super().forget_landmarks(which)
+    def marginalise_landmarks(self, which: BoolArray) -> None:
+        super().marginalise_landmarks(which)
         self.anchors = self.anchors[~which]
 
 
@@ -88,13 +88,13 @@ class CloneAnchoredBelief(JointBelief):
         super().add_landmarks(track_ids, points, jacobian, covs)
         self.anchors = np.append(self.anchors, np.full(len(track_ids), len(self.clones) - 1))
 
-    def forget_landmarks(self, which: BoolArray) -> None:
-        super().forget_landmarks(which)
+    def marginalise_landmarks(self, which: BoolArray) -> None:
+        super().marginalise_landmarks(which)
         self.anchors = self.anchors[~which]
 
-    def forget_clones(self, count: int) -> None:
+    def marginalise_clones(self, count: int) -> None:
         """Marginalise the oldest clones; landmarks anchored there are anchored in the newest."""
-        super().forget_clones(count)
+        super().marginalise_clones(count)
         self.anchors = np.where(self.anchors < count, len(self.clones) - 1, self.anchors - count)
 
     def move(self, delta: Array) -> None:

@@ -84,7 +84,7 @@ class JointBelief:
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
 
-    def forget_clones(self, count: int) -> None:
+    def marginalise_clones(self, count: int) -> None:
         """Marginalise the oldest clones: their rows and columns are dropped."""
         cov, n, first = self._cov, 6 * count, self.clone_columns.start
         self._cov = np.empty((len(cov) - n, len(cov) - n))
@@ -92,7 +92,7 @@ class JointBelief:
         self._cov[:first, first:], self._cov[first:, first:] = cov[:first, first + n :], cov[first + n :, first + n :]
         self.clones, self.first_clones = self.clones[count:], self.first_clones[count:]
 
-    def forget_landmarks(self, which: BoolArray) -> None:
+    def marginalise_landmarks(self, which: BoolArray) -> None:
         """Marginalise landmarks (L,)."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.landmark_columns] = np.repeat(~which, 3)
@@ -240,17 +240,17 @@ def propagate(joint: JointBelief, model: Predictor, at: Linearisation, motion: M
     joint.propagate(prediction, at.transition(joint, increment, prediction))
 
 
-def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
+def marginalise_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last estimates."""
     if len(joint.landmark_ids):
-        forget(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
+        marginalise(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
 
 
-def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
+def marginalise(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
     """Marginalise landmarks (L,) of the state; the memory keeps their last estimates."""
     if which.any():
         memory.remember(joint.landmark_ids[which], joint.points[which])
-        joint.forget_landmarks(which)
+        joint.marginalise_landmarks(which)
 
 
 class LandmarkSightings(NamedTuple):

@@ -93,13 +93,13 @@ def residuals_with_jacobians(
     return stereo.residuals_px(uvs_px, seen.uv_px), H_pose, H_point, seen.depth_m
 
 
-def carried(H_pose: Array, pose_cov: Array) -> Array:
+def projected_cov(H_pose: Array, pose_cov: Array) -> Array:
     """Return ``H P H^T`` (N, 3, 3) of Jacobians (N, 3, 6); the first product is one multiplication for all N."""
     rows = H_pose.reshape(-1, 6) @ pose_cov
     return np.asarray(rows.reshape(H_pose.shape) @ transposed(H_pose))
 
 
-def informed(belief: Belief, matrix: Array, vector: Array) -> Belief:
+def information_update(belief: Belief, matrix: Array, vector: Array) -> Belief:
     """Return the EKF update by an information matrix M (6, 6) and vector n (6,) of the pose.
 
     With P the belief's covariance and P_p its columns of the pose, the update subtracts ``P_p (1 + M P_pp)^-1 M P_p^T``
@@ -131,7 +131,7 @@ def correct_landmarks(
     residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = stereo.noise_px2(uvs_px, rig)
     point_rows = H_point @ landmarks.covs
-    predicted_px2 = point_rows @ transposed(H_point) + carried(H_pose, pose_cov)
+    predicted_px2 = point_rows @ transposed(H_point) + projected_cov(H_pose, pose_cov)
     nis = mahalanobis_squared(residual_px, predicted_px2 + noise_px2)
     right = np.concatenate([point_rows, residual_px[..., None]], axis=2)
     update = transposed(point_rows) @ np.linalg.solve(predicted_px2 + noise_px2 / rig.track_weight, right)
@@ -140,7 +140,7 @@ def correct_landmarks(
     return LandmarkCorrection(after, nis, depth_m)
 
 
-def correct_landmarks_below(
+def correct_gated_landmarks(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig, nis_bound: Array
 ) -> LandmarkMap:
     """Correct those landmarks whose sightings have a NIS below a bound (N,); leave the others as they are."""
@@ -188,7 +188,7 @@ class KnownPoseMapper:
         seen, uvs_px = self._map.seen_again(frame)
         if len(seen):
             nis_bound = chi2_bound(stereo.degrees_of_freedom(uvs_px), self._probability)
-            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
+            seen = correct_gated_landmarks(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
         self._map.keep(seen, frame, T_world_imu)
 
     def landmarks(self) -> Landmarks:

@@ -15,7 +15,7 @@ import pytest
 from filters import iekf
 from filters.ekf_slam import JointEkf
 from filters.kalman.coordinates import AnchoredBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.joint import AtLatestEstimates, JointBelief, forget_lost, linearise_sightings, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, linearise_sightings, marginalise_lost, propagate
 from filters.kalman.online_output import LandmarkMemory
 from tests.filters.conftest import BELIEFS, setup_of, short
 from tests.models.conftest import numerical_jacobian
@@ -50,7 +50,7 @@ def scene(scenario, belief: str = "anchored", disturbed: float = 2.0) -> Scene:
         ekf.step(packet)
     joint = ekf.joint
     propagate(joint, motion_model(sequence.noise, sequence.gravity_world), AT, last.motion)
-    forget_lost(joint, last.frame, LandmarkMemory())
+    marginalise_lost(joint, last.frame, LandmarkMemory())
     assert len(joint.landmark_ids) > 5
     drawn = np.random.default_rng(8).standard_normal(joint.cov.shape[0])
     joint.move(disturbed * np.linalg.cholesky(joint.cov) @ drawn)
@@ -86,7 +86,7 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
 def test_a_move_is_the_groups_and_leaves_the_covariance_of_the_errors_that_it_moves(scenario) -> None:
     """The error by its definition, differentiated before and after a move: what the move must be and carry over."""
     joint, *_ = scene(scenario)
-    joint.forget_clones(1)
+    joint.marginalise_clones(1)
     start, before, P = copy(joint), d_error(joint), joint.cov
     delta = np.linalg.cholesky(P) @ np.random.default_rng(4).standard_normal(len(P))
     joint.move(delta)

@@ -87,7 +87,7 @@ every_linearisation = pytest.mark.parametrize("at", [AtFirstEstimates(), AtLates
 
 def test_a_landmark_whose_anchor_leaves_the_window_is_anchored_in_the_newest_clone(sequence):
     joint = anchored(sequence.rig.T_imu_cam, AtLatestEstimates())
-    joint.forget_clones(1)
+    joint.marginalise_clones(1)
     assert joint.anchors.tolist() == [1, 1]
 
 
