@@ -52,7 +52,7 @@ class SeedEkf(Filter):
         self._belief = _without_biases(predicted(self._belief, self._motion, packet.motion))
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
-            seen = correct_landmarks(seen, uvs_px, self._belief.T_world_imu, np.zeros((6, 6)), self._rig).landmarks
+            seen, *_ = correct_landmarks(seen, uvs_px, self._belief.T_world_imu, np.zeros((6, 6)), self._rig)
             self._correct_pose(seen, uvs_px)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns)

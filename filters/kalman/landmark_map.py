@@ -6,8 +6,8 @@ the same update in information form, ``P+ = (P^-1 + sum_k H_k^T R_k^-1 H_k)^-1``
 identical; no landmark is left out.
 """
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -35,11 +35,6 @@ class LandmarkMap:
     def __len__(self) -> int:
         return self.track_ids.size
 
-    def match(self, track_ids: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the rows of the map and of the ids (N,) that match."""
-        slots, known = rows_of(track_ids, self.track_ids)
-        return slots[known], np.flatnonzero(known)
-
     def select(self, slots: IntArray | BoolArray) -> "LandmarkMap":
         """Return the landmarks of some rows (m,), or of a mask (M,); the ids must stay ascending."""
         return LandmarkMap(self.track_ids[slots], self.points[slots], self.covs[slots])
@@ -50,14 +45,6 @@ class LandmarkMap:
         order = np.argsort(ids)
         points, covs = np.concatenate([self.points, other.points]), np.concatenate([self.covs, other.covs])
         return LandmarkMap(ids[order], points[order], covs[order])
-
-    def corrected(self, rows: BoolArray, points: Array, covs: Array) -> "LandmarkMap":
-        """Return the map with new values (M, 3), (M, 3, 3) where the mask (M,) is True."""
-        return replace(
-            self,
-            points=np.where(rows[:, None], points, self.points),
-            covs=np.where(rows[:, None, None], covs, self.covs),
-        )
 
 
 def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
@@ -112,21 +99,14 @@ def information_update(belief: Belief, matrix: Array, vector: Array) -> Belief:
     return belief.moved(taken[:, -1], belief.cov - taken[:, :-1])
 
 
-class LandmarkCorrection(NamedTuple):
-    """The corrected landmarks, the NIS (N,) of their sightings and their predicted depths (N,) m."""
-
-    landmarks: LandmarkMap
-    nis: Array
-    depth_m: Array
-
-
 def correct_landmarks(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig
-) -> LandmarkCorrection:
+) -> tuple[LandmarkMap, Array, Array]:
     """Correct N landmarks by their sightings (N, 3) px from one pose, each by its own 3x3 EKF (Kang, eqs. 6-10).
 
     ``pose_cov`` (6, 6), zero in the report, is added to the measurement noise, so that an uncertain pose does not make
-    the map overconfident. The NIS is by the stated noise, the update has the rig's weight of tracks.
+    the map overconfident. Return also the NIS (N,) of the sightings and their predicted depths (N,) m. The NIS is by
+    the stated noise, the update has the rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = stereo.noise_px2(uvs_px, rig)
@@ -137,7 +117,7 @@ def correct_landmarks(
     update = transposed(point_rows) @ np.linalg.solve(predicted_px2 + noise_px2 / rig.track_weight, right)
     points, covs = landmarks.points + update[..., 3], landmarks.covs - update[..., :3]
     after = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
-    return LandmarkCorrection(after, nis, depth_m)
+    return after, nis, depth_m
 
 
 def correct_gated_landmarks(
@@ -145,7 +125,9 @@ def correct_gated_landmarks(
 ) -> LandmarkMap:
     """Correct those landmarks whose sightings have a NIS below a bound (N,); leave the others as they are."""
     after, nis, depth_m = correct_landmarks(landmarks, uvs_px, T_world_imu, pose_cov, rig)
-    return landmarks.corrected((nis < nis_bound) & (depth_m > 0.0), after.points, after.covs)
+    passed = (nis < nis_bound) & (depth_m > 0.0)
+    points = np.where(passed[:, None], after.points, landmarks.points)
+    return LandmarkMap(landmarks.track_ids, points, np.where(passed[:, None, None], after.covs, landmarks.covs))
 
 
 class TrackedMap:
@@ -158,11 +140,12 @@ class TrackedMap:
 
     def seen_again(self, frame: StereoFrame) -> tuple[LandmarkMap, Array]:
         """Return the landmarks that the frame sees again and their measurements (N, 3) px; archive the others."""
-        slots, rows = self._in_view.match(frame.track_ids)
+        slots, known = rows_of(frame.track_ids, self._in_view.track_ids)
+        slots = slots[known]
         lost = np.ones(len(self._in_view), dtype=bool)
         lost[slots] = False
         self._left.append(self._in_view.select(lost))
-        return self._in_view.select(slots), frame.uvs_px[rows]
+        return self._in_view.select(slots), frame.uvs_px[known]
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
         """Keep the updated landmarks seen again; start the frame's other tracks from its pose (4, 4)."""
