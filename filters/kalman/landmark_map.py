@@ -47,25 +47,17 @@ class LandmarkMap:
         return LandmarkMap(ids[order], points[order], covs[order])
 
 
-def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return N landmarks triangulated from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
+def first_sighting(new: StereoFrame, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
+    """Triangulate the landmarks of a frame from its pose (4, 4), but for those of too small a disparity (Kang, 3-5).
 
-    The covariance is that of the measurements (N, 3) px by the rig's weight of tracks, propagated through the
-    triangulation.
+    The covariances are those of the measurements by the rig's weight of tracks, propagated through the triangulation.
     """
-    points_cam = stereo.triangulate(uvs_px, rig)
-    T_world_cam = T_world_imu @ rig.T_imu_cam
+    near = new.select(stereo.disparity_px(new.uvs_px) > LEAST_DISPARITY_PX)
+    points_cam, T_world_cam = stereo.triangulate(near.uvs_px, rig), T_world_imu @ rig.T_imu_cam
     d_point_d_uv = T_world_cam[:3, :3] @ np.linalg.inv(stereo.projection_jacobian(points_cam, rig))
     points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-    cov_px2 = rig.cov_uv_px2 / rig.track_weight
-    return points, d_point_d_uv @ cov_px2 @ np.swapaxes(d_point_d_uv, 1, 2)
-
-
-def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
-    """Start the landmarks of rows (m,) of a frame from its pose (4, 4), but for those of too small a disparity."""
-    uvs_px = frame.uvs_px[rows]
-    near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
-    return LandmarkMap(frame.track_ids[rows][near], *started(uvs_px[near], T_world_imu, rig))
+    covs = d_point_d_uv @ (rig.cov_uv_px2 / rig.track_weight) @ np.swapaxes(d_point_d_uv, 1, 2)
+    return LandmarkMap(near.track_ids, points, covs)
 
 
 def residuals_with_jacobians(
@@ -149,8 +141,8 @@ class TrackedMap:
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
         """Keep the updated landmarks seen again; start the frame's other tracks from its pose (4, 4)."""
-        new = np.flatnonzero(~is_among(frame.track_ids, seen.track_ids))
-        self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig))
+        new = frame.select(~is_among(frame.track_ids, seen.track_ids))
+        self._in_view = seen.merged(first_sighting(new, T_world_imu, self._rig))
 
     def landmarks(self) -> Landmarks:
         parts = [*self._left, self._in_view]
