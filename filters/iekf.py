@@ -81,6 +81,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """
     if not len(joint.landmark_ids):
         return
+    assert isinstance(joint, AnchoredBelief)
     seen = linearise_sightings(joint, frame, at, rig)
     weights = weighed(joint, seen, covs_with_state(joint, seen), gate)
     if not weights.any():
@@ -98,7 +99,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
 class Measurement:
     """A prediction, the frame that corrects it, and the weights (L,) of the frame's landmarks."""
 
-    prediction: JointBelief
+    prediction: AnchoredBelief
     frame: StereoFrame
     at: Linearisation
     rig: StereoRig

@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dpotrf
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_right_jacobian, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, transform
 from toolkit.measurements import Motion, StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import FrameGate, mahalanobis_squared
@@ -168,14 +168,6 @@ class JointBelief:
         self._core = self._core.displaced(delta[:d], steps[0])
         self.clones = self.clones @ steps[1:]
         self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)
-
-    def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
-        """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
-
-        They belong to L measurements, each of the newest clone (L, 3, 6) and of a landmark (L, 3, 3).
-        """
-        newest = delta[self.clone_columns][-6:]
-        return H_pose @ se3_right_jacobian(newest), H_point
 
 
 class AtLatestEstimates:

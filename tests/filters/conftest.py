@@ -11,13 +11,12 @@ from functools import cache
 import gtsam
 import numpy as np
 
-from filters.kalman.coordinates import AnchoredBelief
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, skew
-from toolkit.measurements import Prior, StereoRig
+from toolkit.measurements import Prior
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
@@ -168,13 +167,6 @@ def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
 def off_at_the_end_m(sequence: Sequence, estimate: Estimate) -> float:
     """Return how far the estimate of the last frame is from the truth."""
     return float(np.linalg.norm(estimate.T_world_imu[:3, 3] - sequence.truth.T_world_imu[-1, :3, 3]))
-
-
-# How a joint filter's belief is made of a rig and the first core.
-BELIEFS: dict[str, Callable[[StereoRig, Belief], JointBelief]] = {
-    "plain": lambda rig, core: JointBelief(core),
-    "anchored": lambda rig, core: AnchoredBelief(core, rig.T_imu_cam),
-}
 
 
 # Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.

@@ -16,9 +16,10 @@ import pytest
 
 from filters import iekf
 from filters.ekf_slam import JointEkf
+from filters.kalman.coordinates import AnchoredBelief
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, Linearisation, correct_by_landmarks
 from filters.msckf import Msckf
-from tests.filters.conftest import BELIEFS, LOOSENESS, loosened, recorded, setup_of, short
+from tests.filters.conftest import LOOSENESS, loosened, recorded, setup_of, short
 from tests.filters.conftest import gauge as directions
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
@@ -114,7 +115,7 @@ def test_jacobians_at_the_latest_estimates_invent_yaw(name, scenario):
     assert information[:, YAW, YAW].max() > 1.5 * information[0, YAW, YAW]
 
 
-def most_information_gained(scenario, belief: str, correct) -> float:
+def most_information_gained(scenario, belief, correct) -> float:
     """Return by how much of the prior's the information along the gauge ever rises, at worst, in a run."""
     sequence = short(scenario, 3.0 if scenario is DRIVE else 2.0, 20, 3)
     setup = setup_of(sequence)
@@ -126,7 +127,7 @@ def most_information_gained(scenario, belief: str, correct) -> float:
     along = directions(JointBelief(core), turns)
     first = along.T @ np.linalg.solve(model.initial_belief(setup.prior).cov, along)
     root = np.linalg.inv(np.linalg.cholesky(first))
-    ekf, gained = JointEkf(setup, AtLatestEstimates(), partial(BELIEFS[belief], setup.rig), correct), -1.0
+    ekf, gained = JointEkf(setup, AtLatestEstimates(), belief(setup.rig), correct), -1.0
     for packet in sequence.packets():
         ekf.step(packet)
         along = directions(ekf.joint, turns)
@@ -136,9 +137,16 @@ def most_information_gained(scenario, belief: str, correct) -> float:
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
-@pytest.mark.parametrize("correct", [correct_by_landmarks, iekf.correct], ids=["single", "iterated"])
-def test_at_latest_estimates_none_is_gained_in_invariant_errors_but_in_plain_ones(scenario, correct) -> None:
+def test_at_latest_estimates_none_is_gained_in_invariant_errors_but_in_plain_ones(scenario) -> None:
     """Of the whole joint belief, landmarks included; after marginalising them less is left."""
-    # The condition of a joint covariance is some 1e9: seven digits of the information are left.
-    assert most_information_gained(scenario, "anchored", correct) < 1e-6
-    assert most_information_gained(scenario, "plain", correct) > 0.01
+
+    def anchored(rig):
+        return partial(AnchoredBelief, T_imu_cam=rig.T_imu_cam)
+
+    for correct in (correct_by_landmarks, iekf.correct):
+        # The condition of a joint covariance is some 1e9: seven digits of the information are left.
+        gained = most_information_gained(
+            scenario, lambda rig: partial(AnchoredBelief, T_imu_cam=rig.T_imu_cam), correct
+        )
+        assert gained < 1e-6
+    assert most_information_gained(scenario, lambda rig: JointBelief, correct_by_landmarks) > 0.01
