@@ -55,23 +55,6 @@ def test_the_error_to_a_moved_belief_is_what_moved_it(kind):
 
 
 @each_motion
-def test_what_is_inserted_is_read(kind):
-    sequence, packet = recorded(kind)
-    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
-    estimate = some_belief(sequence).estimate(packet.frame.t_ns)
-    model.insert(values, estimate, K)
-    read = model.read(values, K, packet.frame.t_ns)
-    assert set(values.keys()) == set(model.keys(K))
-    assert read.t_ns == estimate.t_ns
-    # A rotation passes through GTSAM's matrix unchanged.
-    np.testing.assert_allclose(read.T_world_imu, estimate.T_world_imu, rtol=0.0, atol=1e-15)
-    np.testing.assert_array_equal(read.bias, estimate.bias)
-    assert (read.v_world is None) == (estimate.v_world is None)
-    if read.v_world is not None:
-        np.testing.assert_array_equal(read.v_world, estimate.v_world)
-
-
-@each_motion
 def test_a_held_state_has_the_covariance_it_is_held_with(kind):
     sequence, packet = recorded(kind)
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from toolkit.models.noise import (
-    LEAST_GYRO_SIGMA_RADPS,
-    LEAST_VELOCITY_SIGMA_MPS,
-    TRACKED_PIXEL_SIGMA_PX,
-    pixel_covariance,
-    twist_noise,
-    white_sigma,
-)
+from toolkit.models.noise import LEAST_GYRO_SIGMA_RADPS, LEAST_VELOCITY_SIGMA_MPS, twist_noise, white_sigma
 
 SIGMAS = np.array([0.5, 0.3, 0.1])
 COUNT = 12_000
@@ -48,8 +41,3 @@ def test_no_odometer_is_taken_for_perfect():
     np.testing.assert_allclose(noise.velocity_noise_density, LEAST_VELOCITY_SIGMA_MPS * np.sqrt(0.1))
     np.testing.assert_allclose(noise.gyro_noise_density, LEAST_GYRO_SIGMA_RADPS * np.sqrt(0.1))
     assert (noise.gyro_random_walk > 0.0).all()
-
-
-def test_the_mean_of_two_rows_has_half_the_variance():
-    np.testing.assert_allclose(np.diag(pixel_covariance(1)), TRACKED_PIXEL_SIGMA_PX**2)
-    np.testing.assert_allclose(np.diag(pixel_covariance(2)), TRACKED_PIXEL_SIGMA_PX**2 * np.array([1.0, 1.0, 0.5]))
