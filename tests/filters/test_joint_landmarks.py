@@ -1,11 +1,13 @@
 """Which landmarks of a joint belief a frame may correct, whichever way the update is made."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from filters import iekf
+from filters.kalman.coordinates import AnchoredBelief
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, correct_by_landmarks
 from tests.filters.conftest import with_clones
 from toolkit.geometry import transform
@@ -21,7 +23,8 @@ CORRECT = {"single": correct_by_landmarks, "iterated": iekf.correct}
 @pytest.mark.parametrize(("depth_m", "accepted"), [(4.0, 1), (-4.0, 0)], ids=["in front", "behind"])
 def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residual(correct, depth_m, accepted):
     """A residual of half a pixel passes the gate on either side: what differs is the side alone."""
-    sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 0, 1)
+    anchored = partial(AnchoredBelief, T_imu_cam=FLIGHT.rig.T_imu_cam)
+    sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 0, 1, anchored)
     point, rig = transform(joint.clones[0] @ sequence.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]])), sequence.rig
     joint.add_landmarks(np.array([7]), point, np.zeros((3, 6)), 0.01 * np.eye(3)[None])
     uv_px = stereo.predict(point, joint.clones[0], rig).uv_px + np.array([0.5, 0.0, 0.5])
