@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -22,9 +22,6 @@ from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recor
 from toolkit.report.run_directory import Results, Shown
 from toolkit.report.text import MISSING, Table, listed, number
 from toolkit.settings import changes_of
-
-if TYPE_CHECKING:
-    from toolkit.report.figures.style import NamedFigure
 
 Kind = Literal["added", "taken"]
 _DIGITS = 3
@@ -273,10 +270,4 @@ def _shown_as(found: ExplanationRecord) -> Shown:
     return Shown(title, found.words, explanation_table(found), found.figures, found.files)
 
 
-def _drawn(found: Explanation) -> "Iterator[NamedFigure]":
-    from toolkit.report.figures.trials import draw_explanation  # here alone, for matplotlib takes long to import
-
-    return draw_explanation(explanation_document(found))
-
-
-EXPLANATIONS = Results("explain.json", "explain.md", explanation_document, read_explanation, _shown_as, _drawn)
+EXPLANATIONS = Results("explain.json", "explain.md", explanation_document, read_explanation, _shown_as)

@@ -350,7 +350,7 @@ class Results(Generic[Found, Record]):
     """The folder of a sweep or an explanation: the names of its document and its Markdown, and how they come about.
 
     The document is ``made`` of what was found, the command, captions by figure and the names of all files; it is
-    ``read`` back and ``shown``. Figures are ``drawn`` of what was found.
+    ``read`` back and ``shown``.
     """
 
     document: str
@@ -358,7 +358,11 @@ class Results(Generic[Found, Record]):
     made: Callable[[Found, str, Mapping[str, str], tuple[str, ...]], Record]
     read: Callable[[Path], Record]
     shown: Callable[[Record], Shown]
-    drawn: Callable[[Found], "Iterator[NamedFigure]"]
+
+    def drawn(self, found: Found) -> "Iterator[NamedFigure]":
+        from toolkit.report.figures.trials import DRAWN  # here alone, for matplotlib takes long to import
+
+        return DRAWN[self.document](found)
 
     def check(self, target: Path) -> None:
         """Raise OutputError unless the results can be written at ``target`` without the loss of anybody's files."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
@@ -17,9 +17,6 @@ from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recor
 from toolkit.report.run_directory import Results, Shown
 from toolkit.report.text import MISSING, Table, cell, number, unit_of
 from toolkit.settings import Scalar, changes_of
-
-if TYPE_CHECKING:
-    from toolkit.report.figures.style import NamedFigure
 
 
 class IntervalRecord(Struct, frozen=True, kw_only=True):
@@ -188,10 +185,4 @@ def _shown_as(sweep: SweepRecord) -> Shown:
     return Shown(f"Sweep of {sweep.sequence.name}", sweep.about, sweep_table(sweep), sweep.figures, sweep.files)
 
 
-def _drawn(sweep: Sweep) -> "Iterator[NamedFigure]":
-    from toolkit.report.figures.trials import draw_sweep  # here alone, for matplotlib takes long to import
-
-    return draw_sweep(sweep)
-
-
-SWEEPS = Results("sweep.json", "sweep.md", sweep_document, read_sweep, _shown_as, _drawn)
+SWEEPS = Results("sweep.json", "sweep.md", sweep_document, read_sweep, _shown_as)

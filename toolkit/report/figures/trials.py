@@ -5,19 +5,19 @@ right what the second loses without it.
 """
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple, TypeGuard
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 from matplotlib.transforms import Bbox
 
-from toolkit.experiment.explanation import ContributionRecord
+from toolkit.experiment.explanation import ContributionRecord, Explanation
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
 from toolkit.files.writing import plain_name
-from toolkit.report.explanation import ExplanationRecord, Kind, over, placed, where
+from toolkit.report.explanation import ExplanationRecord, Kind, explanation_document, over, placed, where
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.sweep import metric_of, shown_value
@@ -200,8 +200,9 @@ class _Bar(NamedTuple):
         return end, min(interval), max(interval)
 
 
-def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
+def draw_explanation(explanation: Explanation) -> Iterator[NamedFigure]:
     """Yield the figure of an explanation; none where the two estimators cannot be compared."""
+    found = explanation_document(explanation)
     whole, (start, goal) = found.gap.error, (str(found.gap.less), str(found.gap.more))
     if whole is None:
         return
@@ -278,3 +279,10 @@ def _log_ticks(axes: Axes) -> None:
     if len(ticks) < 3:
         ticks = [tick for tick in _FINE_TICKS if low <= math.log(tick) <= high]
     axes.set_xticks([math.log(tick) for tick in ticks], [f"{tick:g}" for tick in ticks])
+
+
+# By the document that the figures stand beside.
+DRAWN: Mapping[str, Callable[[Any], Iterator[NamedFigure]]] = {
+    "sweep.json": draw_sweep,
+    "explain.json": draw_explanation,
+}
