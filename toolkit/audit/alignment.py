@@ -189,11 +189,11 @@ def force_beside_camera(sequence: Sequence, camera: CameraMotion, intervals: Int
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
     middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
-    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - intervals.bias_radps
+    w_radps = interval_means(motion, frames_t_ns)[:, 3:] - intervals.bias_radps
     v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
     t_ns, middle_at = subdivided(middle_ns)
     step_s = np.diff(t_ns)[:, None] / NS_PER_S
-    mean = interval_means(motion.t_ns, motion.values, t_ns)
+    mean = interval_means(motion, t_ns)
     half = so3_exp(0.5 * step_s * (mean[:, 3:] - intervals.bias_radps))
     R_first_imu = chained(half @ half)
     gained = np.einsum("kia,kc->kaci", R_first_imu[:-1] @ half, mean[:, :3] * step_s)

@@ -22,7 +22,7 @@ from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.motion_samples import Pairing, TwistSamples
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence, Truth
 
 # Range of the search, and its step in intervals.
@@ -49,15 +49,17 @@ SLOPE_STEP = 0.1
 MOST_RATE = 0.1
 # Limits of the change between the halves: standard errors, and what sound recordings have (s): 14 ms, 3 ms with an IMU.
 CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
-# The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
-# k plus s times sample k + 1.
-LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
+# The columns of the samples that are rates of rotation.
+_RATES = slice(3, 6)
 
 
 def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
-    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined.
+
+    Twists are taken to describe the interval that their pairing states.
+    """
     step_s = usual_step_s(sequence.frames_t_ns)
-    gyro, w_imu = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:]), intervals.w_seen_radps
+    gyro, w_imu = Integral.of(sequence.motion, _RATES), intervals.w_seen_radps
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
     some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
     costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
@@ -191,6 +193,7 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
     w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
     middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
     turning = sequence.motion.of(middle_ns, np.concatenate([np.zeros_like(w_radps), w_radps], axis=1))
+    turning = replace(turning, pairing="mean") if isinstance(turning, TwistSamples) else turning
     as_gyro, rows = replace(sequence, motion=turning), np.flatnonzero(camera.known)
     w_cam_radps = camera.w_radps[rows]
     seen = Intervals(rows, w_cam_radps, None, w_cam_radps, camera.v_mps[rows], sequence.rig.T_imu_cam)
@@ -235,7 +238,7 @@ def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray
     None where the truth covers too few of the rows. A fast clock lowers all rates, as a wrong focal length: that is not
     used.
     """
-    t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion.t_ns, as_gyro.motion.values[:, 3:])
+    t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion, _RATES)
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     since_s = since_s - 0.5 * since_s[-1]
     shift_s, apart_s = found[0] + found[1] * since_s, SLOPE_STEP * float(np.median(np.diff(since_s)))

@@ -547,7 +547,7 @@ def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
     count, most = len(spans), MOST[sequence.motion_kind].windows
     if sequence.motion_kind == "imu" or count <= most:
         return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
-    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
+    mean = interval_means(sequence.motion, sequence.frames_t_ns)[:, 3:]
     rates = mean - np.median(mean, axis=0)
     turned = [float(np.linalg.norm(rates[span[0] : span[-1]], axis=1).sum()) for span in spans]
     return sorted(int(k) for k in np.argsort(turned)[-most:])
@@ -619,5 +619,5 @@ def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:
 
 def _rates(sequence: Sequence, keys: IntArray) -> Array:
     """Return the gyro's means (n, 3) rad/s over the two intervals around each of the frames (n,)."""
-    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
+    mean = interval_means(sequence.motion, sequence.frames_t_ns)[:, 3:]
     return np.asarray(0.5 * (mean[np.maximum(keys - 1, 0)] + mean[np.minimum(keys, len(mean) - 1)]))
