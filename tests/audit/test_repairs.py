@@ -1,12 +1,13 @@
 """What each repair leaves: the clean recording again, or exactly what the fault's page promises."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.audit.conftest import clean_recording, planted, recording, with_pixels
+from tests.audit.conftest import clean_recording, details, planted, recording, with_pixels
 from toolkit.audit import audit
 from toolkit.audit.alignment import is_excluded, is_there
 from toolkit.audit.robust import Scalar
@@ -160,6 +161,15 @@ def test_any_right_handed_turn_of_the_axes_is_undone(scenario: str, of_the: str,
     assert [f.fault for f in outcome.findings] == ["mixed-axes"]
     # Turns are exact; what is left is rounding.
     np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+
+
+def test_a_camera_turned_by_no_convention_of_axes_is_reported_with_its_angle() -> None:
+    for dose in (0.25, 1.0):
+        outcome = audit(faults.turned_camera(clean_recording("drive-imu", 2), dose, 2))
+        assert "mixed-axes" not in {*details(outcome), *outcome.undecided}
+        assert "turned by" in details(outcome)["miscalibration"]
+    angle = re.search(r"turned by (\S+) \+- (\S+) rad against T_imu_cam", details(outcome)["miscalibration"])
+    assert angle is not None and float(angle[1]) == pytest.approx(1.0, abs=0.02 + 3.0 * float(angle[2]))
 
 
 def test_nothing_is_concluded_from_tracks_whose_axes_are_left_to_choose() -> None:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided
+from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided, turn_of_rates
 from toolkit.audit.robust import Scalar, chance_bound, in_motion, regression, slip_stretches
-from toolkit.geometry import Array, IntArray, skew, so3_exp
+from toolkit.geometry import Array, IntArray, skew, so3_exp, so3_log
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
@@ -102,13 +102,18 @@ def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
 
 
 def turn_by_rotations(intervals: Intervals) -> Turn:
-    """Return the rotation that aligns the camera's rates of rotation with the gyro's, less its bias."""
-    seen = intervals.w_seen_radps
+    """Return the rotation that aligns the camera's rates of rotation with the gyro's, less its bias.
+
+    It is linearised at the one that fits best, however large.
+    """
+    turn, _ = turn_of_rates(intervals)
+    seen = intervals.w_cam_radps @ turn.T
     bias = np.tile(np.eye(3), (len(seen), 1, 1))
     response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
     found, formal = regression(response, jacobian)
     cov = jackknife_cov(_robust_solution, response, jacobian)
-    return _tested(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES))
+    turned = found[:3] - so3_log(turn @ intervals.T_imu_cam[:3, :3].T)
+    return _tested(turned, formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES))
 
 
 def _tested(rad: Array, formal: Array, cov: Array, stretches: float) -> Turn:

@@ -8,7 +8,7 @@ import numpy as np
 
 from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
-from toolkit.audit.intervals import Intervals
+from toolkit.audit.intervals import Intervals, turn_of_rates
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Ranking, Scalar, cauchy, ranked, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
@@ -149,12 +149,17 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
 
     With other axes of the body the whole extrinsic is rotated, with other axes of the camera that alone. All 24
     conventions of each and the inverse are compared; turns decide between two possible positions. One is taken only if
-    the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong.
+    the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong. None is
+    where the rotation that fits the rates best is far better than all: the camera is turned, as `miscalibration` says.
     """
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
     found = _ranked(intervals, readings)
     first, twins = found.best, _twins(readings, found.best)
+    turned = readings[0]._replace(T_imu_cam=se3(turn_of_rates(intervals)[0], given[:3, 3]))
+    by_no_convention = _ranked(intervals, [readings[first], turned]).behind[0] > AGAINST_GIVEN
+    if by_no_convention and _of_rotations(intervals, turned.T_imu_cam) == _OWN:
+        return None
     second = next(k for k in found.order if k not in twins)  # the best under which the camera looks another way
     better, alone = found.behind[0], _of_rotations(intervals, given)
     certain = found.behind[second] > AGAINST_SECOND
