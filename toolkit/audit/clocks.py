@@ -21,14 +21,11 @@ from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
-from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence, Truth
 
 # Range of the search, and its step in intervals.
 MOST_S, COARSE_STEP = 0.6, 0.25
-# Means over an interval that are computed at a time: they take a megabyte, however long the recording.
-MEANS_AT_A_TIME = 10_000
 REFINEMENTS = 5
 # The standard error is a jackknife's, times this factor, measured on 24 simulated drives and 8 flights.
 SCATTER = 1.45
@@ -61,8 +58,7 @@ def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
     step_s = usual_step_s(sequence.frames_t_ns)
     gyro, w_imu = Integral.of(sequence.motion, _RATES), intervals.w_seen_radps
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
-    some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
-    costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
+    costs = np.array([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, by_s)) for by_s in candidates])
     costs, at_zero = costs[:-1], costs[-1]
     if not np.isfinite(costs).any():
         return None
@@ -100,36 +96,19 @@ def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolA
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
 
 
-def _gyro_at(
-    gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
-) -> tuple[Array, BoolArray]:
-    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them its samples cover (..., M).
-
-    The intervals are shifted by the offsets (...) s.
-    """
-    begin = intervals.interval - intervals.interval[0]
-    shift_ns = np.rint(np.asarray(offset_s) * NS_PER_S).astype(np.int64)[..., None]
-    t_ns = sequence.frames_t_ns[intervals.interval[0] : intervals.interval[-1] + 2] + shift_ns
-    inside = (t_ns[..., begin] >= gyro.t_ns[0]) & (t_ns[..., begin + 1] <= gyro.t_ns[-1])
-    return gyro.means(t_ns)[..., begin, :], np.asarray(inside)
+def _gyro_at(gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
+    """Return the mean rates (M, 3) of the gyro over intervals that are shifted, and which its samples cover (M,)."""
+    t_ns = sequence.frames_t_ns + round(offset_s * NS_PER_S)
+    inside = (t_ns[intervals.interval] >= gyro.t_ns[0]) & (t_ns[intervals.interval + 1] <= gyro.t_ns[-1])
+    return gyro.means(t_ns)[intervals.interval], inside
 
 
-def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
-    """Return the squared spread (C,) of the differences (C, M, 3) over the intervals that are covered (C, M).
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:
+    """Return the squared spread of the differences (M, 3) over the intervals that are covered (M,).
 
     NaN where these are fewer than LEAST_INTERVALS.
     """
-    reached = inside.sum(axis=-1)
-    apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
-    deviation = MAD_TO_SIGMA * _medians(np.abs(apart - _medians(apart, reached)), reached)
-    return np.where(reached < LEAST_INTERVALS, np.nan, np.sum(deviation[..., 0] ** 2, axis=-1))
-
-
-def _medians(values: Array, reached: IntArray) -> Array:
-    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, of which a row has ``reached`` (C,)."""
-    ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
-    middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
-    return np.asarray(0.5 * (middle[0] + middle[1]))
+    return np.nan if inside.sum() < LEAST_INTERVALS else float(np.sum(spread((w_imu - mean)[inside]) ** 2))
 
 
 def _share_apart(w_imu: Array, mean: Array) -> float:
