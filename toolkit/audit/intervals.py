@@ -117,14 +117,14 @@ class Integral(NamedTuple):
         return cls(motion.t_ns, begin, end, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)]))
 
     def means(self, frames_t_ns: IntArray) -> Array:
-        """Return the mean (..., K - 1, d) over each interval between stamps (..., K)."""
-        return np.asarray(np.diff(self._at(frames_t_ns), axis=-2) / (np.diff(frames_t_ns) / NS_PER_S)[..., None])
+        """Return the mean (K - 1, d) over each interval between stamps (K,)."""
+        return np.asarray(np.diff(self._at(frames_t_ns), axis=0) / (np.diff(frames_t_ns) / NS_PER_S)[:, None])
 
     def _at(self, t_ns: IntArray) -> Array:
         row = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, len(self.t_ns) - 1)
         following = np.minimum(row + 1, len(self.t_ns) - 1)
-        since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[..., None]
-        step_s = np.maximum(self.t_ns[following] - self.t_ns[row], 1)[..., None] / NS_PER_S
+        since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[:, None]
+        step_s = np.maximum(self.t_ns[following] - self.t_ns[row], 1)[:, None] / NS_PER_S
         slope = np.where(since_s > 0.0, (self.end[row] - self.begin[row]) / step_s, 0.0)
         return np.asarray(self.up_to[row] + since_s * (self.begin[row] + 0.5 * since_s * slope))
 
