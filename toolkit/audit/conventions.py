@@ -150,15 +150,13 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
     With other axes of the body the whole extrinsic is rotated, with other axes of the camera that alone. All 24
     conventions of each and the inverse are compared; turns decide between two possible positions. One is taken only if
     the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong. None is
-    where the rotation that fits the rates best is far better than all: the camera is turned, as `miscalibration` says.
+    where another rotation fits the rates far better than all: the camera is turned, as `miscalibration` says.
     """
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
     found = _ranked(intervals, readings)
     first, twins = found.best, _twins(readings, found.best)
-    turned = readings[0]._replace(T_imu_cam=se3(turn_of_rates(intervals)[0], given[:3, 3]))
-    by_no_convention = _ranked(intervals, [readings[first], turned]).behind[0] > AGAINST_GIVEN
-    if by_no_convention and _of_rotations(intervals, turned.T_imu_cam) == _OWN:
+    if _by_no_convention(intervals, readings[first]):
         return None
     second = next(k for k in found.order if k not in twins)  # the best under which the camera looks another way
     better, alone = found.behind[0], _of_rotations(intervals, given)
@@ -209,6 +207,18 @@ def _readings(given: Array) -> list[ExtrinsicConvention]:
         found.append(ExtrinsicConvention(T_imu_cam, f"the camera's {axes}", cause, done, elsewhere_m))
     name, cause = "the inverse of the extrinsic", "T_imu_cam is inverted, from the IMU to the camera"
     return [*found, ExtrinsicConvention(inverse, name, cause, "the extrinsic is inverted", inverse[:3, 3])]
+
+
+def _by_no_convention(intervals: Intervals, best: ExtrinsicConvention) -> bool:
+    """Say whether the rotation that fits the rates best is another than that of the best convention, and far better."""
+    turn, _ = turn_of_rates(intervals)
+    turned = best._replace(T_imu_cam=se3(turn, best.T_imu_cam[:3, 3]))
+    apart = best.T_imu_cam[:3, :3].T @ turn
+    return bool(
+        np.linalg.norm(so3_log(apart)) > SAME_WAY_RAD
+        and _ranked(intervals, [best, turned]).behind[0] > AGAINST_GIVEN
+        and _of_rotations(intervals, turned.T_imu_cam) == _OWN
+    )
 
 
 def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:
