@@ -45,6 +45,7 @@ sweep no --over window.lag_s=1 --over noise.motion_scale=2 --over noise.pixel_si
     | cross two, or sweep each by itself \
     | sweep no --over window.lag_s=1 --over noise.motion_scale=2
 sweep no --over fault:outlier_tracks=many | is no dose; give numbers, in | sweep no --over fault:outlier_tracks=0.1
+sweep no --over fault:blackout=nan | give a finite dose, in s | sweep no --over fault:blackout=1
 export run --format tum | give --format and --out for a trajectory | export run --format tum --out a.tum
 report nowhere | give a run directory, as vislam compare writes it | report run
 export run --format kitti --cov-convention rot-pos/right --out x | has no place for covariances; choose another format \

@@ -92,6 +92,9 @@ def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan):
         (lambda: Trial.of("ekf", {"estimators.ekf.fast": 1}), EstimatorError, "no option fast"),
         (lambda: Trial("no-such"), EstimatorError, "no-such"),
         (lambda: Trial.of("ekf", faults={"standstill": 1.0}), DataError, "can be planted between twists only"),
+        (lambda: Trial.of("ekf", faults={"frame_jitter": -1.0}), DataError, "a dose of -1 s cannot be planted"),
+        (lambda: Trial.of("ekf", faults={"blackout": np.inf}), SettingsError, "give a finite dose, in s"),
+        (lambda: Trial.of("ekf", faults={"few_tracks": np.nan}), SettingsError, "give a finite dose, in tracks"),
     ],
 )
 def test_what_cannot_be_run_is_told_before_anything_runs(plan, trial, error, what, monkeypatch):

@@ -3,6 +3,7 @@
 Whoever asks what a change costs or brings lists the trials; what is not kept from before is run, side by side.
 """
 
+import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
@@ -46,12 +47,15 @@ class Trial(NamedTuple):
         faults: Mapping[str, float] | None = None,
         keep: Iterable[str] = (),
     ) -> "Trial":
-        """Return a trial; a fault at its clean dose is none. Raises SettingsError for a fault there is not."""
+        """Return a trial; a fault at its clean dose is none. Raises SettingsError for a fault or dose there is not."""
         doses = dict(sorted((faults or {}).items()))
         for name in doses:
             if name not in INJECTORS:
                 raise SettingsError(no_such("fault", name, INJECTORS))
         struck = tuple((name, float(dose)) for name, dose in doses.items() if dose != INJECTORS[name].clean)
+        for name, dose in struck:
+            if not math.isfinite(dose):
+                raise SettingsError(f"fault:{name}={dose}: give a finite dose, in {INJECTORS[name].unit}")
         return cls(estimator, tuple(sorted((changes or {}).items())), struck, frozenset(keep))
 
     def __str__(self) -> str:
