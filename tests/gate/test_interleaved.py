@@ -86,11 +86,11 @@ def _run(*given):
 """
 
 
-def baseline_of_a_drive() -> Baseline:
+def baseline_of_a_drive(estimator: str = "dead-reckoning") -> Baseline:
     """Return a baseline that was not measured: what is timed needs to know the cases alone."""
-    case = Case("drive", True, (0,), ("dead-reckoning",), 1.0)
+    case = Case("drive", True, (0,), (estimator,), 1.0)
     series = SeriesRecord(status=("ok",), speed=(1.0,), causal={})
-    return Baseline(installed_releases(), ((case, Measured(("hash",), ("print",), {"dead-reckoning": series})),))
+    return Baseline(installed_releases(), ((case, Measured(("hash",), ("print",), {estimator: series})),))
 
 
 def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path, monkeypatch):
@@ -133,9 +133,7 @@ class Side:
 def test_what_the_other_code_can_be_timed_on_and_this_one_cannot_is_missing(monkeypatch, old, new, found):
     monkeypatch.setattr(interleaved, "unpacked", lambda _: nullcontext(()))
     monkeypatch.setattr(interleaved, "timers", lambda *_: nullcontext((Side("old", *old), Side("new", *new))))
-    case = Case("drive", True, (0,), ("ekf",), 1.0)
-    measured = Measured(("hash",), ("print",), {"ekf": SeriesRecord(status=("ok",), speed=(1.0,), causal={})})
-    verdicts, notes = compare_speed(Baseline(installed_releases(), ((case, measured),)), "v1", 0.05, silent)
+    verdicts, notes = compare_speed(baseline_of_a_drive("ekf"), "v1", 0.05, silent)
     assert [verdict.finding for verdict in verdicts] == ([] if found == "noted" else [found])
     assert bool(notes) is (found == "noted")
 
