@@ -177,6 +177,7 @@ def test_functions_of_ones_own_are_swept_beside_what_is_named(short):
         ({FRAMES: ["much"]}, "'much' is no dose; give numbers, in share"),
         ({FRAMES: [0.0]}, "no value to vary it over"),
         ({"window.lag": [1.0]}, "no setting window.lag"),
+        ({"seeds": [3]}, "seeds: no run depends on it"),
         ({FRAMES: [0.1], TURNED: [0.1], "window.lag_s": [1.0]}, "3 axes make no grid"),
     ],
 )

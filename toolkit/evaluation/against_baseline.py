@@ -163,7 +163,6 @@ class FolderOfRuns:
             where = f"its truth is not at {path}, where the baseline had it"
             raise DataError(f"{where}; name another place with --truth")
         truth, terms = read_truth(sequence, path), Terms(gap_s=gap_s, least_coverage_percent=0.0)
-        _check_truth(path.as_posix(), truth.digest, before)
         names = {file: str(file.relative_to(self.folder)) for file in files}
         runs = {name: evaluated_run(Item("", sequence, name, file), truth, terms) for file, name in names.items()}
         return _record(sequence, (path.as_posix(), truth.digest), runs, align, before)
@@ -198,7 +197,6 @@ class EvaluatedRuns:
         if not runs:
             raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
         truth = next(one for one in self._record.sequences if one.sequence == runs[0].sequence)
-        _check_truth(truth.truth, truth.truth_hash, before)
         by_file = {run.file or run.run: run for run in runs}
         return _record(sequence, (truth.truth, truth.truth_hash), by_file, align, before)
 
@@ -220,8 +218,10 @@ def _record(
 ) -> ScoredSequence:
     """Return the scores of a sequence's runs, and why there are none, by file; ``truth`` is its place and its hash.
 
-    Raises DataError where all failed, or any where a baseline is made of them.
+    Raises DataError where the truth is not the baseline's, all failed, or any where a baseline is made of them.
     """
+    if before is not None and truth[1] != before.truth_hash:
+        raise DataError(f"{truth[0]} differs from the baseline's truth; make a new baseline")
     why = {
         file: run.log[0] if run.file else f"{run.run}: {run.log[0]}" for file, run in runs.items() if run.status != "ok"
     }
@@ -238,11 +238,6 @@ def _record(
 
 # Runs of a system on sequences, in a folder or scored before.
 GivenRuns = FolderOfRuns | EvaluatedRuns
-
-
-def _check_truth(path: str, digest: str, before: SequenceRecord | None) -> None:
-    if before is not None and digest != before.truth_hash:
-        raise DataError(f"{path} differs from the baseline's truth; make a new baseline")
 
 
 def new_trajectory_baseline(

@@ -85,15 +85,14 @@ def measure(case: Case, bounds: BoundsRecord, settings: Settings, workers: int, 
     """
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
-    recordings = recordings_of(present, settings)
-    entries = {name: find(name) for name in present.estimators}
+    recordings, entries = recordings_of(present, settings), {name: find(name) for name in present.estimators}
     units = [
         Unit(recording, recording.seed, name, settings, entry=entry)
         for recording in recordings
         for name, entry in entries.items()
     ]
     try:
-        if units:
+        if units:  # read anew, whatever this process kept of an earlier check
             prepare(recordings[0])
         with (
             progress_for(f"{case.source}: {len(case.seeds) * len(case.estimators)} runs") as progress,
