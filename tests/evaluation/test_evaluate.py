@@ -133,6 +133,7 @@ def test_a_bad_file_is_reported_in_one_line_and_beside_a_good_one_counted(scene,
     [
         (("truths", "results/good/S0"), 3, "it has no folders; expected SYSTEM/SEQUENCE.tum or"),
         (("truth.tum", "a=results"), 3, "results: it holds no trajectory"),
+        (("truth.tum", "a=truth.tum", "a=truth.tum"), 3, "truth.tum: it is given twice"),
         (("truth.tum", "truth.tum", "--metric", "ate_se_m"), 2, "did you mean ate_se3_m?"),
         (("truth.tum", "truth.tum", "--least-coverage", "101"), 2, "expected percent from 0 to 100"),
         (("truth.tum", "truth.tum", "--out", "results"), 4, "results"),

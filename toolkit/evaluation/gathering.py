@@ -94,8 +94,10 @@ def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
         files = _trajectory_files(path) if path.is_dir() else (path,)
         if not files:
             raise DataError(f"{path}: it holds no trajectory")
-        runs = found.setdefault(name or _name(path), {})
-        runs[_name(truth)] = (*runs.get(_name(truth), ()), *files)
+        had = found.get(name or _name(path), {}).get(_name(truth), ())
+        if twice := set(had) & set(files):
+            raise DataError(f"{min(twice)}: it is given twice, and would count as two runs; keep one")
+        found[name or _name(path)] = {_name(truth): (*had, *files)}
     return found
 
 
