@@ -102,9 +102,9 @@ def test_white_vectors_have_a_degree_of_freedom_a_number_and_correlated_ones_few
 
 def test_medians_and_seeds_are_compared_in_pairs():
     errors = np.random.default_rng(0).gamma(2.0, 1.0, 1000)
-    twice, equal = less_median(errors, 2.0 * errors, "tracks"), less_median(errors, errors, "tracks")
+    twice, equal = less_median(errors, 2.0 * errors), less_median(errors, errors)
     assert (twice.low, is_clear(equal)) == (pytest.approx(2.0), False)
-    assert less_median(errors[:50], errors[:50], "tracks") is None
+    assert less_median(errors[:50], errors[:50]) is None
     of_seeds = np.random.default_rng(0).gamma(50.0, 1.0, 10)
     better = less_over_seeds(of_seeds, 1.5 * of_seeds + np.linspace(-0.1, 0.1, 10))
     assert better.low > 1.4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toolkit.experiment.statistics import holm, mean_interval, paired_p
-from toolkit.gate.significance import smallest_detectable
+from toolkit.gate.significance import POWER, smallest_detectable
 
 
 @pytest.mark.parametrize("n", [2, 5, 24, 400])
@@ -40,15 +40,15 @@ def test_holm_is_the_closed_test_of_bonferroni():
 
 def test_the_smallest_change_seen_is_seen_as_often_as_promised():
     rng = np.random.default_rng(6)
-    spread, seeds, rate, power = 0.04, 24, 0.001, 0.95
+    spread, seeds, rate = 0.04, 24, 0.001
     # From the true spread, of which every set of seeds has an estimate only.
     exact = spread * rng.standard_normal(200_000)
     n_over = np.sqrt(exact.size / seeds)
-    shift = smallest_detectable(exact, rate, power) * n_over
+    shift = smallest_detectable(exact, rate) * n_over
     caught = paired_p(rng.normal(shift, spread, (4000, seeds))) <= rate
     # Large samples have normal quantiles where 24 seeds have Student's: a little less power than promised.
     assert 0.80 < caught.mean() < 0.97
     few = rng.normal(0.0, spread, (300, seeds))
-    shifts = np.array([smallest_detectable(one, rate, power) for one in few])
+    shifts = np.array([smallest_detectable(one, rate) for one in few])
     caught = paired_p(rng.normal(np.median(shifts), spread, (4000, seeds))) <= rate
-    assert caught.mean() == pytest.approx(power, abs=0.03)
+    assert caught.mean() == pytest.approx(POWER, abs=0.03)

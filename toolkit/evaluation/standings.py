@@ -22,7 +22,7 @@ from toolkit.answers import Status
 from toolkit.errors import DataError, one_line
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
-from toolkit.experiment.statistics import holm, quantiles_of_all
+from toolkit.experiment.statistics import Quartiles, holm, quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.files import documents
 from toolkit.files.documents import Count, Value, of_attributes
@@ -58,14 +58,6 @@ class RunRecord(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"metrics.{key} is null, and notes does not say why")
         if self.status != "ok" and not self.log:
             raise ValueError(f"status is {self.status}, and log does not say why")
-
-
-class Quartiles(Struct, frozen=True, kw_only=True):
-    """Quartiles in which what failed is infinitely bad; null where that decides one."""
-
-    lower_quartile: float | None
-    median: float | None
-    upper_quartile: float | None
 
 
 class OverRuns(Struct, frozen=True, kw_only=True):
@@ -135,17 +127,13 @@ class EvaluatedSystems:
     @cached_property
     def cells(self) -> Mapping[tuple[str, str], OverRuns]:
         """The runs by system and sequence; every pair of the two has some."""
-        return {pair: self._over_runs(*pair, len(runs)) for pair, runs in self._runs_of.items()}
-
-    @cached_property
-    def _runs_of(self) -> Mapping[tuple[str, str], list[RunRecord]]:
         found: dict[tuple[str, str], list[RunRecord]] = {}
         for run in self.runs:
             found.setdefault((run.estimator, run.sequence), []).append(run)
-        return found
+        return {pair: self._over_runs(*pair, runs) for pair, runs in found.items()}
 
     def ok_runs(self, system: str, sequence: str) -> list[RunRecord]:
-        return [run for run in self._runs_of[system, sequence] if run.status == "ok"]
+        return [run for run in self.runs if (run.estimator, run.sequence, run.status) == (system, sequence, "ok")]
 
     @property
     def all_ok(self) -> bool:
@@ -194,13 +182,13 @@ class EvaluatedSystems:
             for name in self.systems
         }
 
-    def _over_runs(self, system: str, sequence: str, runs: int) -> OverRuns:
-        good = [run.metrics for run in self.ok_runs(system, sequence)]
+    def _over_runs(self, system: str, sequence: str, runs: Sequence[RunRecord]) -> OverRuns:
+        good = [run.metrics for run in runs if run.status == "ok"]
         metrics: dict[str, Quartiles | None] = {}
         for metric in self.scored_metrics:
             values = [value for run in good if (value := run.get(metric.key)) is not None]
-            metrics[metric.key] = None if good and not values else _quartiles(values, runs - len(good), metric)
-        return OverRuns(sequence=sequence, estimator=system, runs=runs, ok=len(good), metrics=metrics)
+            metrics[metric.key] = None if good and not values else _quartiles(values, len(runs) - len(good), metric)
+        return OverRuns(sequence=sequence, estimator=system, runs=len(runs), ok=len(good), metrics=metrics)
 
     def _standing(self, system: str, ranks: Array) -> StandingRecord:
         cells = [self.cells[system, sequence] for sequence in self.sequences]

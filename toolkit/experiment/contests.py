@@ -198,7 +198,7 @@ def _of_one_run(sequence: Recorded) -> tuple[Compared, Compared]:
         both, of_mine, of_its = np.intersect1d(seen, also_seen, assume_unique=True, return_indices=True)
         in_time = np.argsort(sequence.held_out.frame[both], kind="stable")
         errors: tuple[Array, Array] = (mine[of_mine][in_time], its[of_its][in_time])
-        return less_median(*errors, "stretches of time")
+        return less_median(*errors)
 
     return by_drift, by_tracks
 
@@ -278,7 +278,7 @@ def _ratio(one: _Drift, other: _Drift) -> Advantage:
     return _advantage(found, len(one.over_m), "stretches of the path")
 
 
-def less_median(one: Array, other: Array, parts: str) -> Advantage | None:
+def less_median(one: Array, other: Array) -> Advantage | None:
     """Return how many times as large the other's median is, of errors (M,) of the same things in order of time.
 
     By a block jackknife over ten stretches of time, with Student's t. None with fewer than ten errors a stretch.
@@ -290,7 +290,7 @@ def less_median(one: Array, other: Array, parts: str) -> Advantage | None:
         return float(np.log(np.median(others) / np.median(mine)))
 
     found = jackknife_interval(log_ratio, one, other, level=1.0 - CONFIDENCE)
-    return _advantage(found, STRETCHES, parts) if np.isfinite(found).all() else None
+    return _advantage(found, STRETCHES, "stretches of time") if np.isfinite(found).all() else None
 
 
 def less_over_seeds(one: Array, other: Array) -> Advantage | None:

@@ -38,13 +38,18 @@ class Spread:
     most: float
 
 
-class QuantilesAll(Struct, frozen=True, kw_only=True):
-    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it."""
+class Quartiles(Struct, frozen=True, kw_only=True):
+    """Quartiles in which what failed is infinitely bad; null where that decides one."""
 
-    # A run's score until it failed or diverged does not show how it would have gone on.
     lower_quartile: float | None
     median: float | None
     upper_quartile: float | None
+
+
+class QuantilesAll(Quartiles, frozen=True, kw_only=True):
+    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it."""
+
+    # A run's score until it failed or diverged does not show how it would have gone on.
     reason: Annotated[str, Meta(description="why a quartile is null")] | UnsetType = UNSET
 
 

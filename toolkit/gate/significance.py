@@ -79,7 +79,7 @@ class Pairs(Compared):
 
     def detectable(self, rate: float) -> float:
         """Return the excess over a margin, as a log ratio, that one test at ``rate`` finds with 95 % power."""
-        return smallest_detectable(self.differences, rate, POWER)
+        return smallest_detectable(self.differences, rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +234,13 @@ def geometric_mean(values: Array) -> float:
     return float(np.exp(log_of(values).mean()))
 
 
-def smallest_detectable(differences: Array, rate: float, power: float) -> float:
-    """Return the excess of the mean over the margin that one test at ``rate`` sees with ``power``.
+def smallest_detectable(differences: Array, rate: float) -> float:
+    """Return the excess of the mean over the margin that one test at ``rate`` sees with the power POWER.
 
-    From the spread of the differences (n,) themselves: (t(1 - rate) + t(power)) standard errors, the usual
+    From the spread of the differences (n,) themselves: (t(1 - rate) + t(POWER)) standard errors, the usual
     approximation of the noncentral t; infinite for fewer than two differences.
     """
     n = differences.shape[-1]
     if n < 2:
         return float("inf")
-    return float((stdtrit(n - 1, 1.0 - rate) + stdtrit(n - 1, power)) * standard_error(differences))
+    return float((stdtrit(n - 1, 1.0 - rate) + stdtrit(n - 1, POWER)) * standard_error(differences))
