@@ -16,6 +16,7 @@ import numpy as np
 
 from toolkit.evaluation.against_baseline import (
     CHANGES_PERCENT,
+    ScoredSequence,
     SequenceRecord,
     check_trajectories,
     new_trajectory_baseline,
@@ -38,14 +39,14 @@ class Drawn:
     rng: np.random.Generator
     sequences: tuple[str, ...] = tuple(f"sequence-{i}" for i in range(SEQUENCES))
 
-    def scored(self, sequence: str, align: str, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+    def scored(self, sequence: str, align: str, gap_s: float, before: SequenceRecord | None) -> ScoredSequence:
         keys = scored(align)
         shared, own = self.rng.standard_normal(self.runs), self.rng.standard_normal((len(keys), self.runs))
         factors = self.grown * np.exp(SCATTER * (np.sqrt(SHARED) * shared + np.sqrt(1.0 - SHARED) * own))
         scores = {key: tuple(row.tolist()) for key, row in zip(keys, factors, strict=True)}
         scores[TIME_COVERAGE] = (100.0,) * self.runs
         files = tuple(f"{sequence}/{run}.tum" for run in range(self.runs))
-        return SequenceRecord(sequence=sequence, truth="truth.tum", truth_hash="", files=files, scores=scores)
+        return SequenceRecord(sequence=sequence, truth="truth.tum", truth_hash="", files=files, scores=scores), {}
 
 
 def week(runs: int, seed: int) -> tuple[int, int]:
