@@ -12,9 +12,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from toolkit.experiment.contests import Contest, contests_of
 from toolkit.experiment.statistics import MeanNees, QuantilesAll, Spread, mean_nees, quantiles_of_all, spread_of
@@ -39,29 +40,18 @@ NEES, NIS = "nees_pose_mean", "nis_mean"
 TRUTH = "truth"
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """The mean over runs of a metric, 1 on average where consistent, and the band of 95 % of consistent estimators.
+class ConsistencyMark(Struct, frozen=True, kw_only=True):
+    """What a run's errors, or its innovations, say of the uncertainty it states."""
 
-    ``refused_much`` says that a gate had refused far more of the innovations than a consistent estimator's gate does.
-    """
-
-    metric: str
-    mean: float
-    low: float
-    high: float
-    refused_much: bool = False
-
-    @property
-    def verdict(self) -> Verdict:
-        if self.mean > self.high:
-            return "contradicted" if self.metric == TREND else "overconfident"
-        if self.mean >= self.low:
-            return "consistent"
-        return "heavy-tailed" if self.refused_much else "timid"
+    verdict: Annotated[
+        Verdict, Meta(description="mean in, above, below its band; below, behind a gate that rejected many; a trend")
+    ]
+    metric: Annotated[str, Meta(description="key of the metric it rests on")]
+    mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]
+    band: Annotated[tuple[float, float], Meta(description="of 95 % of consistent estimators; of a trend to its limit")]
 
 
-def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
+def consistency_of(runs: Iterable[Scored]) -> ConsistencyMark | None:
     """Judge one kind of output of an estimator over one run or several: by NEES where there is one, else by NIS.
 
     Unless these show overconfidence, a correction trend beyond its limit decides. Returns None where none of these is
@@ -73,13 +63,13 @@ def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
         return by_errors
     trends, limits = _known(scored, TREND), _known(scored, LIMIT)
     if trends and (mean := float(np.mean(trends))) > (limit := float(np.mean(limits))):
-        return Consistency(TREND, mean, 0.0, limit)
+        return ConsistencyMark(verdict="contradicted", metric=TREND, mean=mean, band=(0.0, limit))
     return by_errors
 
 
-def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
+def _by_errors(scored: Sequence[Scored]) -> ConsistencyMark | None:
     if nees := _known(scored, NEES):
-        return Consistency(NEES, sum(nees) / len(nees), *nees_band(float(POSE_DOF * len(nees))))
+        return _by_band(NEES, nees, float(POSE_DOF * len(nees)))
     innovating = [one for one in scored if one.nis_dof and one.scores.values.get(NIS) is not None]
     if not (nis := _known(innovating, NIS)):
         return None
@@ -87,7 +77,15 @@ def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
     dof = len(nis) ** 2 / sum(1.0 / one.nis_dof for one in innovating if one.nis_dof)
     accepted = _known(scored, ACCEPTED)
     refused_much = bool(accepted) and refuses_much(sum(accepted) / len(accepted))
-    return Consistency(NIS, sum(nis) / len(nis), *nees_band(dof), refused_much)
+    return _by_band(NIS, nis, dof, refused_much=refused_much)
+
+
+def _by_band(metric: str, values: list[float], dof: float, *, refused_much: bool = False) -> ConsistencyMark:
+    """Judge values that are 1 on average where consistent; small ones prove nothing behind a gate that refused much."""
+    mean, (low, high) = sum(values) / len(values), nees_band(dof)
+    below: Verdict = "heavy-tailed" if refused_much else "timid"
+    verdict: Verdict = "overconfident" if mean > high else "consistent" if mean >= low else below
+    return ConsistencyMark(verdict=verdict, metric=metric, mean=mean, band=(low, high))
 
 
 def _known(scored: Iterable[Scored], key: str) -> list[float]:
@@ -190,7 +188,7 @@ class Row:
         return next((note for note in notes if note), "no run is ok" if not self.good else "not computed")
 
     @cached_property
-    def consistency(self) -> Consistency | None:
+    def consistency(self) -> ConsistencyMark | None:
         """The verdict on the stated uncertainty by the only run, or over seeds by the runs that are ok, or None."""
         only = self.outcomes[0].outputs.get(self.output) if len(self.outcomes) == 1 else None
         return consistency_of(self.good if only is None else (only,))

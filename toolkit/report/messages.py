@@ -149,7 +149,7 @@ def _contradicted(comparison: Comparison) -> Iterator[str]:
     found = [(_name_of(row), one) for row in rows if (one := row.consistency) is not None]
     if found:
         names, trends = listed(name for name, _ in found), listed(number(one.mean) for _, one in found)
-        limit = number(max(one.high for _, one in found))
+        limit = number(max(one.band[1] for _, one in found))
         yield f"contradicted: tracks push {names} one way, trend {trends} (limit {limit}); check calibration and stamps"
 
 
@@ -159,7 +159,7 @@ def _marks(comparison: Comparison) -> Iterator[str]:
     for row in comparison.lines:
         found = row.consistency
         if found is not None and row.mark in _REMEDY:
-            name, band = metrics_called((found.metric,))[0].name, f"{number(found.low)} to {number(found.high)}"
+            name, band = metrics_called((found.metric,))[0].name, f"{number(found.band[0])} to {number(found.band[1])}"
             by_band.setdefault((row.mark, name, band), []).append((row, number(found.mean)))
     for (mark, name, band), marked in sorted(by_band.items(), key=lambda item: list(_REMEDY).index(item[0][0])):
         names, values = listed(_name_of(row) for row, _ in marked), listed(value for _, value in marked)
@@ -411,7 +411,7 @@ def _trust(comparison: Comparison) -> str:
 def _overconfidence(row: Row) -> float:
     """Return how many times as large errors are as a row states, by its NEES; 0 where there is none."""
     found = row.consistency
-    return math.sqrt(found.mean) if found is not None and found.metric == NEES and found.mean > found.high else 0.0
+    return math.sqrt(found.mean) if found is not None and found.metric == NEES and found.mean > found.band[1] else 0.0
 
 
 def _cost(contest: Contest) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.answers import STATUS_MEANING, Output, Status
-from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison, ConsistencyMark, Row
 from toolkit.experiment.statistics import QuantilesAll, Spread
 from toolkit.files.documents import Count, Value, of_attributes, reader
 from toolkit.metrics import CONTRACT_KEYS, Metric, describe, known_metrics
@@ -57,18 +57,6 @@ class AuditEntry(Struct, frozen=True, kw_only=True):
 
 
 Undecided = Annotated[dict[str, str] | UnsetType, Meta(description="by fault, why it could not be decided")]
-
-
-class ConsistencyMark(Struct, frozen=True, kw_only=True):
-    """What a run's errors, or its innovations, say of the uncertainty it states."""
-
-    verdict: Annotated[
-        Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"],
-        Meta(description="mean in, above, below its band; below, behind a gate that rejected many; a trend"),
-    ]
-    metric: Annotated[str, Meta(description="key of the metric it rests on")]
-    mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]
-    band: Annotated[tuple[float, float], Meta(description="of 95 % of consistent estimators; of a trend to its limit")]
 
 
 Consistency = Annotated[ConsistencyMark | UnsetType, Meta(description="absent where no NEES, NIS or trend decides")]
@@ -269,15 +257,8 @@ def _run(row: Row) -> ScoredRun:
         metrics=metrics,
         notes={key: notes[key] for key in sorted(notes)},
         log=tuple(row.run.log),
-        consistency=_mark(row),
+        consistency=row.consistency or UNSET,
     )
-
-
-def _mark(row: Row) -> ConsistencyMark | UnsetType:
-    found = row.consistency
-    if found is None:
-        return UNSET
-    return ConsistencyMark(verdict=found.verdict, metric=found.metric, mean=found.mean, band=(found.low, found.high))
 
 
 def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
@@ -291,7 +272,7 @@ def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
         metrics={metric.key: _metric(group, metric) for metric in metrics},
         notes={metric.key: group.reason(metric.key) for metric in metrics if group.spread(metric.key) is None},
         over_seeds=_whole_runs(group),
-        consistency=_mark(group),
+        consistency=group.consistency or UNSET,
         ok_share=group.counts["ok"] / len(group.outcomes),
     )
 
