@@ -123,12 +123,16 @@ class EstimatorEntry:
     def options(self) -> Mapping[str, tuple[Scalar, ...]]:
         """Return the settings that this estimator alone reads, each with the values it takes: ``OPTIONS``.
 
-        The first value is the default; there is none where the module names no values, and any may be set.
+        The first value is the default; there is none where the module names no values, and any may be set. Raises
+        EstimatorError where it is not so.
         """
         options = self.found.constants().get("OPTIONS", ())
-        if isinstance(options, dict):
-            return {str(name): tuple(values) for name, values in options.items()}
-        return dict.fromkeys(map(str, options), ()) if isinstance(options, tuple) else {}
+        try:
+            if isinstance(options, dict):
+                return msgspec.convert(options, dict[str, tuple[Scalar, ...]])
+            return dict.fromkeys(msgspec.convert(options, tuple[str, ...]), ())
+        except msgspec.ValidationError as error:
+            raise self._refused("OPTIONS has to be a tuple of names, or to map names to tuples of values") from error
 
     def ingredients(self) -> Mapping[str, Mapping[str, Scalar]]:
         """Return what the estimator has of what estimators differ in, each with the settings that take it away.

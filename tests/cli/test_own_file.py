@@ -70,9 +70,20 @@ def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter, capsys):
     assert "my_filter.py: there is no such file" in capsys.readouterr().err
 
 
+def test_a_file_whose_process_dies_is_a_run_that_failed_and_the_others_are_kept(capsys):
+    Path("dies.py").write_text("import os\ndef build(setup): os._exit(7)\n")
+    words = ["compare", "drive", "--estimators", "dies.py,dead-reckoning", *SHORT, "--workers", "2", "--out", "run"]
+    assert main(words) == 1
+    assert "dies failed: its process ended with status 7 before it answered" in capsys.readouterr().out
+    ended = {run["estimator"]: run["status"] for run in json.loads(Path("run/metrics.json").read_text())["runs"]}
+    assert ended == {"dies": "failed", "dead-reckoning": "ok"}
+    assert main(["report", "run"]) == 0
+
+
 @pytest.mark.parametrize(
     ("estimators", "text", "told"),
     [
+        ("opts.py", "OPTIONS = {'a': 5}\ndef build(setup): ...\n", "OPTIONS has to be a tuple of names, or to map"),
         ("my_filter", "", "is given as its file, as in my_filter.py"),
         ("ekf.py", "def build(setup): ...\n", "give the file another name"),
         ("my_filter.py,deeper/my_filter.py", "def build(setup): ...\n", "give the file another name"),

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from toolkit.answers import Run
 from toolkit.datasets import is_built_in, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories.covariances import CovConvention
 from toolkit.errors import DataError
+from toolkit.estimate import Landmarks
 from toolkit.estimator import Build
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
@@ -220,7 +222,9 @@ def outcomes_of(
         for i, result in coming:
             unit, store = jobs[missing[i]]
             if isinstance(result, LostUnit):
-                yield missing[i], Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
+                run = Run(unit.estimator, "failed", None, None, Landmarks.none(), timings=None, log=(result.why,))
+                kept = run if unit.keep_run else None
+                yield missing[i], Outcome(unit.seed, unit.estimator, "failed", log=run.log, run=kept)
             else:
                 yield missing[i], result if store is None else store.keep(unit, result)
 
