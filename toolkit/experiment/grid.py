@@ -54,8 +54,10 @@ class Trial(NamedTuple):
                 raise SettingsError(no_such("fault", name, INJECTORS))
         struck = tuple((name, float(dose)) for name, dose in doses.items() if dose != INJECTORS[name].clean)
         for name, dose in struck:
-            if not math.isfinite(dose):
-                raise SettingsError(f"fault:{name}={dose}: give a finite dose, in {INJECTORS[name].unit}")
+            unit = INJECTORS[name].unit
+            if not (0.0 <= dose <= 1.0 if unit == "share" else math.isfinite(dose)):
+                wanted = "a share from 0 to 1" if unit == "share" else f"a finite dose, in {unit}"
+                raise SettingsError(f"fault:{name}={dose:g}: give {wanted}")
         return cls(estimator, tuple(sorted((changes or {}).items())), struck, frozenset(keep))
 
     def __str__(self) -> str:

@@ -528,7 +528,7 @@ def frame_jitter(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequ
     return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(1e9 * off_s).astype(np.int64))
 
 
-@_injector("share")
+@_injector("s/s")
 def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
     """Let the camera's clock run fast by a share of the time: a cheap quartz, frames counted and not stamped."""
     since_ns = sequence.frames_t_ns - sequence.frames_t_ns[0]
