@@ -99,7 +99,25 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,
     ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
-    plan, kept = _planned(**locals())
+    plan, kept = _planned(
+        source,
+        estimators,
+        own=own,
+        truth=truth,
+        trajectories=trajectories,
+        cov_convention=cov_convention,
+        max_frames=max_frames,
+        from_s=from_s,
+        to_s=to_s,
+        every=every,
+        keep=keep,
+        seed=seed,
+        seeds=seeds,
+        settings=settings,
+        workers=workers,
+        scheduler=scheduler,
+        resume=resume,
+    )
     if kept is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if kept is None else (kept,))[0])
