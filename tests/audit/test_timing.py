@@ -136,6 +136,8 @@ def test_a_step_of_the_camera_clock_is_no_offset_to_shift_all_frames_by() -> Non
 def test_a_camera_clock_that_drifts_is_reported_and_one_that_cannot_be_compared_is_not_blessed() -> None:
     assert "clock-change" in details(audit(faults.camera_clock_drift(recording("drive-imu"), 0.02)))
     assert "would not show" in audit(recording("drive")).undecided["clock-change"]
+    found = {one.fault: one for one in audit(faults.camera_clock_drift(recording("flight", 3, 10.0), 0.02)).findings}
+    assert "more in the second half" in found["time-offset"].detail and not found["time-offset"].repaired
 
 
 @pytest.mark.parametrize("seed", range(2))

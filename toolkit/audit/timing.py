@@ -580,16 +580,17 @@ def _shift_of_clocks(evidence: Evidence, intervals: Intervals, found: Scalar) ->
     by = f"{1e3 * offset_s:.1f} +- {1e3 * found.error:.1f} ms"
     seen = f"the camera turns as the gyro does when the frames' stamps are shifted by {by}"
     detail = f"{seen}: frames are stamped {'late' if offset_s < 0.0 else 'early'}"
-    change = change_of_offset(sequence, intervals)
+    remedy = _shifted(sequence, offset_s)
+    after = evidence.after(remedy)
+    change = _fitted_change(after) or change_of_offset(sequence, intervals)
     if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
         parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms more in the second half than in the first"
         return Symptom.warning(f"{detail}, but by {parted}", ONE_CLOCK)
-    remedy = _shifted(sequence, offset_s)
     if (worse := _velocities_against(sequence, intervals, offset_s)) > AGAINST_SHIFT:
         fit_worse = f"the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
         why = "stamp rates of rotation and velocities by one clock, the camera's"
         return Symptom.warning(f"{seen}, but then {fit_worse}", why)
-    left = _left_after(evidence, offset_s) if sequence.motion_kind == "imu" else Scalar(0.0, 0.0)
+    left = _left(after) if sequence.motion_kind == "imu" else Scalar(0.0, 0.0)
     if left is None or abs(left.value) > max(LEAST_OFFSET_S, DOUBTFUL_SIGMAS * left.error):
         more = "" if left is None else f", but {1e3 * left.value:.1f} +- {1e3 * left.error:.1f} ms"
         return Undecided(f"{seen}, and tracks and IMU do not fit then{more}")
@@ -647,7 +648,7 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
         return None
     shift_s = found.value if abs(found.value) > NEAR_S else 0.0
     for _ in range(SHIFTS):
-        left = _left_after(evidence, shift_s)
+        left = _left(evidence.after(_shifted(evidence.sequence, shift_s)) if shift_s else evidence)
         if left is None:
             return found
         shift_s += left.value
@@ -656,10 +657,9 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
     return found
 
 
-def _left_after(evidence: Evidence, shift_s: float) -> Scalar | None:
-    """Return the offset by the self-calibration with an IMU, once the frames are shifted; None where it fails."""
-    shifted = evidence.after(_shifted(evidence.sequence, shift_s)) if shift_s else evidence
-    fitted = shifted.self_calibration
+def _left(evidence: Evidence) -> Scalar | None:
+    """Return the offset by the self-calibration with an IMU; None where it fails."""
+    fitted = evidence.self_calibration
     return None if fitted is None else Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
 
 
@@ -730,7 +730,7 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
 
     With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by rotations.
     """
-    found = _fitted_change(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
+    found = _fitted_change(evidence) or change_of_offset(evidence.sequence, intervals)
     if found is None:
         return Undecided("too little change of rotation in half of the recording: whether the clocks drift is unknown")
     change_s, error_s = found.value, found.error
@@ -744,11 +744,11 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     return Symptom.warning(f"the offset of frames and motion samples changes by {by}", ONE_CLOCK)
 
 
-def _fitted_change(evidence: Evidence, intervals: Intervals) -> Scalar | None:
+def _fitted_change(evidence: Evidence) -> Scalar | None:
     """Return the change (s) by the self-calibration; rotations of half a short recording may agree at a wrong shift."""
     found = evidence.self_calibration
-    if found is not None and found.windows == 1:
-        found = self_calibration(evidence.sequence, evidence.camera_motion, intervals, fewest_windows=2)
+    if found is not None and evidence.intervals is not None and found.windows == 1:
+        found = self_calibration(evidence.sequence, evidence.camera_motion, evidence.intervals, fewest_windows=2)
     if found is None or found.windows == 1:
         return None
     return Scalar(float(found.value[CHANGE]), float(found.error[CHANGE]))
