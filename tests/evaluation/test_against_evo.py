@@ -45,6 +45,12 @@ def evo_scores(reference: PosePath3D, estimate: PosePath3D, ten_frames_are_a_sec
     placed = copy.deepcopy(estimate)
     placed.align_origin(reference)
     scores["ate_none_m"] = evo_rmse(APE(POSITION), reference, placed)
+    path_m, poses = reference.distances, estimate.poses_se3
+    # evo takes the pair nearest to 100 m, we the first beyond it: hand its formula our pairs.
+    last = np.searchsorted(path_m, path_m + 100.0)
+    pairs = [(i, j) for i, j in enumerate(last) if j < path_m.size and path_m[j] - path_m[i] < 110.0]
+    errors = [RPE.rpe_base(reference.poses_se3[i], reference.poses_se3[j], poses[i], poses[j]) for i, j in pairs]
+    scores["rpe_100m_percent"] = np.sqrt(np.mean([error[:3, 3] @ error[:3, 3] for error in errors]))
     if ten_frames_are_a_second:
         for key, relation in (("rpe_1s_m", POSITION), ("rpe_1s_deg", ANGLE_DEG)):
             metric = RPE(relation, delta=10, delta_unit=Unit.frames, all_pairs=True)
