@@ -12,7 +12,7 @@ import pytest
 
 from tests.datasets.test_own_tables import recorded, written
 from toolkit import cli
-from toolkit.cli import recordings, runs
+from toolkit.cli import arguments, recordings, runs
 
 COMMANDS = ("", *(command.name for command in cli._COMMANDS))
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
@@ -51,8 +51,11 @@ def test_examples_in_help_run(command, vislam, kitti_drive):
 
 def test_what_the_help_repeats_is_what_there_is():
     """Their own modules take too long to import for a help text."""
+    from toolkit.datasets.bags import ROLES
     from toolkit.datasets.trajectories import FORMATS
+    from toolkit.datasets.trajectories.covariances import CONVENTIONS
     from toolkit.simulation import SCENARIOS
 
     assert set(recordings.SCENARIOS) == set(SCENARIOS)
-    assert tuple(FORMATS) == runs.FORMATS
+    repeated = (runs.FORMATS, arguments.TOPIC_ROLES, arguments.COV_CONVENTIONS)
+    assert repeated == (tuple(FORMATS), tuple(ROLES), tuple(CONVENTIONS))

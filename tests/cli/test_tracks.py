@@ -56,12 +56,6 @@ def test_pictures_on_a_full_disk_are_4_and_none_is_left(folder, vislam, capfd, w
     assert not Path("stills").exists()
 
 
-def test_images_are_neither_simulated_nor_repeated_over_seeds(folder, vislam, one_line):
-    for words, complaint in ((("--tracks", "simulated"), "EuRoC folders only"), (("--seeds", "2"), "under every seed")):
-        assert vislam("compare", str(folder), *words) == 3
-        assert complaint in one_line()
-
-
 @pytest.mark.usefixtures("one_process", "unrendered")
 def test_images_alone_are_compared_and_labelled(folder, vislam, capsys):
     assert vislam("compare", str(folder), "--estimators", "ekf,batch", "--out", "run") == 0

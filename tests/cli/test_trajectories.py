@@ -16,8 +16,6 @@ from toolkit.report.records import read_metrics, read_report
 
 WithoutPixels = Callable[[], AbstractContextManager[None]]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20", "--workers", "1")
-# What an export with covariances is written as.
-OF_COV = ("--cov-convention", "rot-pos/right")
 COVARIANCES = {"tum": "pos-rot/fixed", "euroc": "rot-pos/left", "openvins": "rot-pos/mixed"}
 
 
@@ -121,7 +119,6 @@ def test_another_system_is_in_everything_a_comparison_leaves(again):
         ("run", ("--estimator", "batch"), "has no trajectory of batch; there are dead-reckoning, ekf, truth"),
         ("gaps", ("--estimator", "ekf"), "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames"),
         ("again", ("--estimator", "by tum", "--output", "causal"), "no causal trajectory of by tum, only a final one"),
-        ("run", ("--estimator", "ekf", *OF_COV), "has no place for covariances; choose another format"),
         ("seeds", (), "over seeds and holds no trajectories"),
     ],
 )

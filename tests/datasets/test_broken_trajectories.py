@@ -2,25 +2,16 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.datasets.conftest import assert_refused
-from tests.datasets.test_euroc import recording as asl_folder
-from tests.datasets.test_kitti_odometry import drive as odometry
-from tests.datasets.test_kitti_raw import drive as raw
 from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.truth import load_truth
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3, so3_exp
-
-__all__ = ["asl_folder", "odometry", "raw"]  # fixtures
-Arrays = dict[str, Any]
-# What an array is exchanged for, the arrays to leave out, and what the answer says.
-Broken = tuple[Arrays, tuple[str, ...], str]
 
 
 def test_a_rig_of_many_cameras_may_share_what_they_have(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.cli.arguments import COV_CONVENTIONS
 from toolkit.datasets.trajectories import euroc, openvins, read_poses, tum
 from toolkit.datasets.trajectories.covariances import CONVENTIONS, OURS, StatedCovariances, to_right, written_as
 from toolkit.errors import DataError
@@ -51,10 +50,6 @@ def test_derivatives_of_every_convention_are_the_numerical_ones(name: str) -> No
         ends = [[se3_log(se3_inverse(T) @ perturbed(kind, T, sign * step)) for sign in (1, -1)] for step in steps]
         numerical = np.array([(plus - minus) / 2e-4 for plus, minus in ends]).T
         np.testing.assert_allclose(numerical, exact, atol=1e-8 * np.abs(exact).max())
-
-
-def test_the_command_line_knows_every_convention() -> None:
-    assert tuple(CONVENTIONS) == COV_CONVENTIONS
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -229,17 +229,6 @@ def loaded(path: Path) -> Sequence:
     return load_sequence(str(path))
 
 
-@pytest.mark.parametrize(("name", "frames"), [("V1_01_easy", 2895), ("V2_01_easy", 2240)])
-def test_the_real_recordings_have_100_tracks_in_every_frame(
-    real: Callable[[str], Path], name: str, frames: int
-) -> None:
-    sequence = loaded(real(f"euroc/{name}"))
-    assert sequence.frame_count == frames
-    np.testing.assert_array_equal(np.bincount(sequence.observations.frame), np.full(frames, 100))
-    # an ideal track of a corner lives until it is lost or leaves the view: a second or so at 20 Hz
-    assert 10 < np.median(np.bincount(sequence.observations.track_id)) < 40
-
-
 @pytest.mark.parametrize("name", ["V1_01_easy", "V2_01_easy"])
 def test_the_noise_covers_what_the_real_imu_and_the_truth_differ_by_between_frames(
     real: Callable[[str], Path], name: str

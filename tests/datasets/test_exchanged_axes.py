@@ -92,10 +92,3 @@ def test_an_estimate_that_is_lost_is_not_reported_to_be_in_other_axes() -> None:
         wandering[:, :3, 3] += np.cumsum(np.random.default_rng(seed).normal(0.0, 0.5, (len(truth), 3)), axis=0)
         assert told(truth, wandering) == ""
     assert told(truth, se3(estimate[:, :3, :3], rng.normal(0.0, 1.0, (len(truth), 3)))) == ""
-
-
-def test_an_exchange_undoes_what_its_inverse_did() -> None:
-    _, estimate = of("flight", 3.0)
-    for exchange in exchanges():
-        undone = exchange.reread(Exchange(exchange.matrix.T, exchange.struck).reread(estimate))
-        np.testing.assert_allclose(undone, estimate, atol=1e-12)

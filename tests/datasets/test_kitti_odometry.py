@@ -47,7 +47,7 @@ def test_poses_of_the_download_are_found_beside_the_sequences(drive: Path, tmp_p
 
 
 def test_poses_follow_images_whose_stamps_are_out_of_order(drive: Path) -> None:
-    stamps(drive, lambda k: f"{1.0 - 0.1 * k:.6f}")
+    (drive / "times.txt").write_text("".join(f"{1.0 - 0.1 * k:.6f}\n" for k in range(FRAMES)))
     sequence = load_sequence(str(drive))
     np.testing.assert_array_equal(sequence.truth.t_ns, sequence.frames_t_ns)
     np.testing.assert_allclose(sequence.truth.T_world_imu[:, 0, 3], STEP_M * np.arange(FRAMES)[::-1], atol=1e-9)
@@ -82,15 +82,6 @@ def test_a_calibration_of_images_half_as_large_is_reported(drive: Path) -> None:
     text = (drive / "calib.txt").read_text()
     (drive / "calib.txt").write_text(text.replace(" 160", " 80").replace(" 100 ", " 50 "))
     assert reported()
-
-
-def rename(drive: Path, name: Callable[[Path], str]) -> None:
-    for path in list(drive.glob("image_?/*.png")):
-        path.rename(path.with_name(name(path)))
-
-
-def stamps(drive: Path, line: Callable[[int], str]) -> None:
-    (drive / "times.txt").write_text("".join(f"{line(k)}\n" for k in range(FRAMES)))
 
 
 def test_rows_without_names_keep_their_places(drive: Path) -> None:
@@ -142,5 +133,6 @@ def test_the_real_beginning_of_06_is_found_from_images_alone(
 
 def test_images_are_numbered_by_the_end_of_their_names_where_these_are_no_numbers(drive: Path) -> None:
     before = load_sequence(str(drive)).observations.uv_px
-    rename(drive, lambda path: f"frame{path.name}")
+    for path in list(drive.glob("image_?/*.png")):
+        path.rename(path.with_stem(f"frame{path.stem}"))
     np.testing.assert_array_equal(load_sequence(str(drive)).observations.uv_px, before)

@@ -90,27 +90,17 @@ def test_only_recordings_are_recognised(drive: Sequence, tmp_path: Path) -> None
     ]
 
 
-@pytest.mark.parametrize("interrupted", ["numpy.savez_compressed", "json.dumps", "pathlib.Path.rename", ".partial-"])
+@pytest.mark.parametrize("interrupted", ["numpy.savez_compressed", "json.dumps", "pathlib.Path.rename"])
 def test_an_interruption_leaves_what_was_there(
     interrupted: str, drive: Sequence, flight: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before the old one is moved away, and, of a partial one, between the two moves."""
-    rename = Path.rename
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    def interrupt_second(self: Path, target: Path) -> Path:
-        if interrupted in self.name:
-            raise KeyboardInterrupt
-        return rename(self, target)
-
     vislam_recording.save(drive, tmp_path / "old")
     with monkeypatch.context() as patched:
-        if interrupted == ".partial-":
-            patched.setattr(Path, "rename", interrupt_second)
-        else:
-            patched.setattr(interrupted, interrupt)
+        patched.setattr(interrupted, interrupt)
         for name in ("old", "new"):
             with pytest.raises(KeyboardInterrupt):
                 vislam_recording.save(flight, tmp_path / name)
@@ -122,10 +112,6 @@ def test_a_folder_with_other_things_is_not_touched(drive: Sequence, tmp_path: Pa
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match=r"thesis\.tex"):
         vislam_recording.save(drive, tmp_path)
-    with pytest.raises(OutputError, match="is not a directory"):
-        vislam_recording.save(drive, tmp_path / "thesis.tex")
-    with pytest.raises(OutputError, match="cannot be written"):
-        vislam_recording.save(drive, tmp_path / "thesis.tex" / "below")
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
     (tmp_path / "other").mkdir()
     (tmp_path / "other/recording.json").write_text('{"tracks": 4}')  # of another program

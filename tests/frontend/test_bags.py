@@ -22,9 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from toolkit.cli import main
-from toolkit.cli.arguments import TOPIC_ROLES
 from toolkit.datasets import load_images, load_sequence
-from toolkit.datasets.bags import ROLES
 from toolkit.datasets.io import bag_reader
 from toolkit.errors import DataError
 from toolkit.geometry import se3, so3_exp
@@ -293,10 +291,6 @@ def test_a_truth_keeps_the_poses_it_has_or_is_of_positions_alone_or_left_out(asl
     assert load_sequence(str(path)).truth is None
     prism = load_sequence(str(path), 0, Frontend(topics="truth=/leica/position"))
     assert any(alone in fact for fact in prism.provenance.facts)
-
-
-def test_the_roles_offered_are_those_there_are() -> None:
-    assert tuple(ROLES) == TOPIC_ROLES
 
 
 def bare(ros: Ros, asl: Path, infos: tuple[float, float] | None = None) -> list[Item]:

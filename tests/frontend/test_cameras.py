@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.frontend.conftest import EQUIDISTANT, RADTAN, SIZE
-from toolkit.errors import DataError
 from toolkit.frontend import Camera, rectified
 from toolkit.geometry import Array, se3, so3_exp, transform
 
@@ -47,19 +46,3 @@ def test_pixels_beyond_the_lens_are_known_as_such() -> None:
     for one in (rig, wide):
         assert 0.5 < one.seen(0).mean() < 1.0
         assert not one.seen(0)[0].any()
-
-
-@pytest.mark.parametrize(
-    ("T", "complaint"),
-    [
-        (se3(np.eye(3), np.array([0.12, 0.0, 0.0])), "stands left of the left one"),
-        (se3(np.eye(3), np.array([0.0, 0.12, 0.0])), "above, below or behind"),
-        (np.eye(4), "both cameras stand in the same place"),
-        (se3(so3_exp(np.array([0.0, 1.0, 0.0])), np.array([-0.12, 0.0, 0.0])), "57 deg apart"),
-        (None, "of 320x240 and 640x480 px, and a pair needs one size"),
-    ],
-)
-def test_cameras_that_are_no_stereo_pair_are_refused(T: Array | None, complaint: str) -> None:
-    right = RADTAN if T is not None else replace(RADTAN, size_px=(640, 480))
-    with pytest.raises(DataError, match=f"^cam.yaml: .*{complaint}.*; "):
-        rectified(RADTAN, right, T_RIGHT_LEFT if T is None else T, "cam.yaml")

@@ -1,6 +1,5 @@
 """Folders laid out as people download, extract and convert them: recognised, or told in a line what to name."""
 
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -66,14 +65,6 @@ def test_what_kalibrs_bag_extractor_writes_is_a_recording(asl: Path) -> None:
     extracted.rename(asl / "extracted")
     assert stamps(asl / "extracted") == expected
     assert (load_sequence(str(asl / "extracted")).motion.values == motion.values).all()
-
-
-@pytest.mark.parametrize("part", ["mav0/cam0/data", "mav0/cam0", "mav0/imu0/data.csv"])
-def test_of_a_part_of_a_recording_the_whole_is_named(asl: Path, part: str) -> None:
-    with pytest.raises(
-        DataError, match=f"a part of a recording: name the whole recording, {re.escape(str(asl / 'mav0'))};"
-    ):
-        load_sequence(str(asl / part))
 
 
 def test_recordings_are_named_some_levels_below(asl: Path, tmp_path: Path) -> None:

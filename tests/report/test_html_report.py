@@ -145,8 +145,6 @@ def edited(change: Callable[[Json], object]) -> Callable[[str], str]:
     ("name", "spoil", "expected"),
     [
         ("report.json", None, "has no report.json: an earlier version wrote it, or that was removed; repeat it"),
-        ("manifest.json", None, "missing"),
-        ("metrics.json", lambda _: "{", "cannot be read"),
         ("metrics.json", lambda _: "{}", "has not the schema vislam.metrics/1"),
         ("trajectories/late_final.tum", None, "late_final.tum is missing; repeat the comparison"),
         ("trajectories/late_final.tum", lambda _: "1 2 3\n", "columns"),
