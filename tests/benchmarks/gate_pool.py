@@ -33,7 +33,6 @@ from toolkit.initialization import start_from_measurements
 from toolkit.measurements import MotionNoise, Prior, TwistNoise
 from toolkit.metrics import Evaluation, ate, innovations, nees, reprojection
 from toolkit.metrics.parts.scores import Unavailable
-from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.progress import SILENT
 from toolkit.registry import find
 from toolkit.sequence import Observations, Sequence
@@ -55,16 +54,9 @@ def dithered(sequence: Sequence, rng: np.random.Generator) -> Sequence:
     uv_px = seen.uv_px + DITHER * sigma_px * rng.standard_normal(seen.uv_px.shape)
     root_dt = np.sqrt(float(np.median(np.diff(motion.t_ns))) * 1e-9)
     first, second = (DITHER / root_dt * rng.standard_normal((motion.t_ns.size, 3)) for _ in range(2))
-    samples: TwistSamples | ImuSamples
-    if isinstance(motion, TwistSamples):
-        assert isinstance(noise, TwistNoise)
-        v_mps = motion.v_mps + noise.velocity_noise_density * first
-        samples = replace(motion, v_mps=v_mps, w_radps=motion.w_radps + noise.gyro_noise_density * second)
-    else:
-        assert not isinstance(noise, TwistNoise)
-        accel_mps2 = motion.accel_mps2 + noise.accel_noise_density * first
-        gyro_radps = motion.gyro_radps + noise.gyro_noise_density * second
-        samples = replace(motion, accel_mps2=accel_mps2, gyro_radps=gyro_radps)
+    linear = noise.velocity_noise_density if isinstance(noise, TwistNoise) else noise.accel_noise_density
+    off = np.hstack([linear * first, noise.gyro_noise_density * second])
+    samples = motion.of(motion.t_ns, motion.values + off)
     return replace(sequence, observations=Observations(seen.frame, seen.track_id, uv_px), motion=samples)
 
 

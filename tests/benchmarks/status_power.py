@@ -36,12 +36,10 @@ from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.contests import too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
-from toolkit.measurements import NS_PER_S
-from toolkit.metrics import Evaluation, ate, score_run
+from toolkit.metrics import Evaluation, ate
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.reprojection import RATIO
 from toolkit.progress import SILENT
-from toolkit.sequence import Observations
 from toolkit.sequence import Sequence as Recorded
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -96,11 +94,6 @@ class Scenario:
     seed: int
     fault: str
     estimators: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Return a name as one of a file."""
-        return "_".join(filter(None, (self.recording, str(self.seed), self.fault.replace(" ", "-"))))
 
 
 def scenarios(draw: int) -> list[Scenario]:
@@ -178,16 +171,8 @@ def stretch(recording: str, seed: int) -> Recorded:
     length_s = LENGTH_S[recording]
     whole = simulate(SCENARIOS[recording], seed)
     begin_s = np.random.default_rng(seed).uniform(1.0, 59.0 - length_s) if seed % 2 else 0.0
-    t_s = (whole.frames_t_ns - whole.frames_t_ns[0]) / NS_PER_S
-    inside = (t_s >= begin_s) & (t_s <= begin_s + length_s)
-    rows, first = inside[whole.observations.frame], int(np.argmax(inside))
-    seen = whole.observations.select(rows)
-    return replace(
-        whole,
-        frames_t_ns=whole.frames_t_ns[inside],
-        observations=Observations(seen.frame - first, seen.track_id, seen.uv_px),
-        prior=whole.prior if first == 0 else None,
-    )
+    inside = (whole.frames_s >= begin_s) & (whole.frames_s <= begin_s + length_s)
+    return whole.with_frames(np.flatnonzero(inside))
 
 
 def planted(scenario: Scenario) -> Recorded | None:
@@ -244,6 +229,8 @@ def _unless_refused(make: Callable[[], Result]) -> Result | str:
 def _scored(one: Ended, run: Run, outcome: Outcome, prepared: Prepared, with_truth: Recorded) -> Ended:
     scored = list(outcome.outputs.values())
     verdicts = [found.verdict for found in map(consistency_of, ([output] for output in scored)) if found is not None]
+    causal = outcome.outputs.get("causal")
+    accepted = None if causal is None else causal.scores.values[ACCEPTED]
     return replace(
         one,
         error_m=_error_m(run, with_truth),
@@ -251,16 +238,9 @@ def _scored(one: Ended, run: Run, outcome: Outcome, prepared: Prepared, with_tru
         mark=next((verdict for verdict in verdicts if verdict != "consistent"), ""),
         found=tuple(sorted(finding.fault for finding in prepared.findings)),
         log=run.log,
-        refuses=refuses_much(accepted) if (accepted := _accepted(run, prepared)) is not None else False,
+        refuses=accepted is not None and refuses_much(accepted),
         harms=any(RATIO in output.scores.notes and output.scores.values[RATIO] is not None for output in scored),
     )
-
-
-def _accepted(run: Run, prepared: Prepared) -> float | None:
-    """Return how much of what it tested the gate of a run accepted (percent), None where it has no gate."""
-    if run.causal is None:
-        return None
-    return score_run(run, "causal", prepared.sequence).values.get(ACCEPTED)
 
 
 def _error_m(run: Run, sequence: Recorded) -> float | None:
@@ -284,7 +264,7 @@ def run_draw(draw: int, file: Path) -> None:
             if one.estimator in missing:
                 with file.open("a") as out:
                     out.write(json.dumps(asdict(one)) + "\n")
-        print(scenario.name, flush=True)
+        print(*where, flush=True)
 
 
 def read(file: Path) -> list[Ended]:
