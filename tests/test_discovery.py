@@ -186,6 +186,12 @@ def test_a_dataset_of_another_package_is_read(announce: Announce, tmp_path: Path
     assert datasets.load_sequence(str(tmp_path / "recording")).name == "loaded recording"
 
 
+def scored() -> metrics.Scores:
+    sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
+    run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
+    return metrics.score_run(run, "causal", sequence)
+
+
 def test_a_missing_dependency_makes_one_file_unavailable(announce: Announce, tmp_path: Path) -> None:
     announce(
         metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "needy.py": f"import a_package_nobody_has.part\n{METRIC}"}
@@ -194,6 +200,7 @@ def test_a_missing_dependency_makes_one_file_unavailable(announce: Announce, tmp
     lacking = {"needy": "it needs the package a_package_nobody_has"}
     assert metrics.unavailable() == datasets.unavailable() == lacking
     assert list(metrics.describe())[-1] == "answer"
+    assert scored().values["answer"] == 42.0
     with pytest.raises(VislamError, match="needy is unavailable: it needs the package a_package_nobody_has"):
         metrics.metrics_called(["needy"])
     (tmp_path / "recording").write_text("of nobody")
@@ -233,6 +240,7 @@ def test_an_estimators_file_that_is_no_python_is_named_with_its_line(announce: A
             "answer.py: the metric answer has best='bigger'; it is one of",
         ),
         (METRIC.replace('("the", "answer")', '"answer"'), "the metric answer has heading='answer'; it is two lines"),
+        (METRIC.replace('"answer"', '"pairs"'), "answer.py: both declare pairs; rename it in one"),
     ],
 )
 def test_a_metric_file_that_is_none_is_named(
@@ -254,10 +262,8 @@ def test_a_metric_file_that_is_none_is_named(
 @pytest.mark.parametrize("answer", ['Scores({"other": 1.0})', '{"answer": 1.0}', "None"])
 def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer: str) -> None:
     announce("toolkit.metrics", {"answer.py": METRIC.replace('Scores({"answer": 42.0})', answer)})
-    sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
-    run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
     with pytest.raises(ExtensionError, match=r"answer\.py: score must return Scores of \['answer'\], and returned"):
-        metrics.score_run(run, "causal", sequence)
+        scored()
 
 
 def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp_path: Path) -> None:

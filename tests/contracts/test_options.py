@@ -42,10 +42,18 @@ def test_the_first_value_of_an_option_is_its_default_and_every_other_changes_the
         assert np.abs(answered(name, sequence, {option: value}) - usual).max() > 1e-12
 
 
-def test_another_value_is_refused_with_those_there_are():
-    settings = settings_of({"estimators": {"ekf-slam": {"linearisation": "frist"}}}, "here")
-    with pytest.raises(EstimatorError, match="option linearisation is 'frist'; it takes first or latest"):
-        find("ekf-slam").check_options(settings)
+@pytest.mark.parametrize(
+    ("name", "options", "expected"),
+    [
+        ("ekf-slam", {"linearisation": "frist"}, "option linearisation is 'frist'; it takes first or latest"),
+        ("ekf", {"landmark_uncertainty": 3}, "option landmark_uncertainty is 3; it takes true or false"),
+        ("ekf-slam", {"linearization": 1}, "has no option linearization; it has landmarks, linearisation"),
+        ("batch", {"landmark_uncertainty": True}, "has no option landmark_uncertainty; it has none; ekf has it"),
+    ],
+)
+def test_an_option_or_a_value_that_there_is_not_is_refused_with_those_there_are(name, options, expected):
+    with pytest.raises(EstimatorError, match=expected):
+        find(name).check_options(settings_of({"estimators": {name: options}}, "here"))
 
 
 def test_what_takes_an_ingredient_away_is_a_setting_that_exists():

@@ -8,7 +8,7 @@ import pytest
 
 from tests.metrics.conftest import drive_poses, make_run, make_sequence
 from toolkit import metrics
-from toolkit.errors import ExtensionError, VislamError
+from toolkit.errors import VislamError
 from toolkit.metrics import score_run
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.models.gating import chi2_bound, mean_below_bound
@@ -101,30 +101,6 @@ def test_a_defect_in_a_metric_passes_through(case, monkeypatch):
     monkeypatch.setattr(drift, "score", lambda evaluation: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         case()
-
-
-DROPPED_IN = """from toolkit.metrics import Metric, Scores
-
-ORDER = 99
-METRICS = (Metric("answer", "the answer (1)", "1", ("the", "answer"), table="always"),)
-
-
-def score(evaluation):
-    return Scores({"answer": 42.0})
-"""
-
-
-def test_a_dropped_in_file_is_a_metric_whose_key_no_other_file_may_declare(tmp_path, monkeypatch, case):
-    monkeypatch.setattr(metrics, "_found", metrics._found.__wrapped__)
-    monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
-    (tmp_path / "dropped_in.py").write_text(DROPPED_IN)
-    assert list(metrics.describe())[-1] == "answer"
-    assert case().values["answer"] == 42.0
-    (tmp_path / "again.py").write_text(DROPPED_IN.replace('"answer"', '"pairs"'))
-    with pytest.raises(
-        ExtensionError, match=r"(and \S+again\.py|again\.py and \S+): both declare pairs; rename it in one"
-    ):
-        metrics.describe()
 
 
 def test_a_metric_is_chosen_by_its_key_its_name_or_what_stands_above_its_column():
