@@ -26,7 +26,7 @@ from tests.datasets.test_course_npy import T_REGULAR_OPTICAL, as_course, save_np
 from tests.datasets.test_kitti_raw import DRIVE, packet
 from tests.datasets.test_kitti_raw import drive as day_and_drive
 from tests.datasets.test_own_tables import recorded, rig_of, tables_of, written
-from tests.frontend.conftest import START_NS, camera_yaml, imu_text
+from tests.frontend.conftest import IMU_NOISE, START_NS, camera_yaml, write_asl
 from tests.frontend.test_bags import Item, Ros, images_of, motion_of, raw
 from toolkit import load_sequence
 from toolkit.audit import Audit
@@ -243,7 +243,6 @@ PLACES = [np.linalg.matrix_power(T_LEFT_RIGHT, side) for side in (0, 1)]
 TABLES, YAMLS = ([f"mav0/cam{side}/{name}" for side in (0, 1)] for name in ("data.csv", "sensor.yaml"))
 IMAGES = ["mav0/cam0/data", "mav0/cam1/data"]
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
-NOISE = "".join(f"{s}_noise_density: 2.0e-3\n{s}_random_walk: 2.0e-4\n" for s in ("gyroscope", "accelerometer"))
 
 
 def many(*corners_px: float, struck: float = 1.0) -> np.ndarray:
@@ -274,16 +273,6 @@ def save_short(path: Path, arrays: dict[str, Any]) -> None:
         stream.write(arrays["features"].tobytes()[:-20])
 
 
-def save_struck(path: Path, arrays: dict[str, Any]) -> None:
-    """Write an archive with ten bytes of its compressed features lost."""
-    np.savez_compressed(path, **arrays)
-    content = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as archive:
-        at = archive.getinfo("features.npy").header_offset + 60
-    content[at : at + 10] = bytes(10)
-    path.write_bytes(bytes(content))
-
-
 @pytest.fixture(scope="session")
 def film(kitti_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of KITTI's odometry, and beside it one of ASL with the same images."""
@@ -294,15 +283,10 @@ def film(kitti_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             path.unlink()
     for name in ("times.txt", "poses.txt"):
         (odometry / name).write_text("".join((odometry / name).read_text().splitlines(True)[:FRAMES]))
-    for side, T in enumerate(PLACES):
-        (asl / IMAGES[side]).mkdir(parents=True)
+    write_asl(asl, CAMERA, PLACES, stamps)
+    for side in (0, 1):
         for t_ns, path in zip(stamps, sorted((odometry / f"image_{side}").iterdir()), strict=True):
             shutil.copy(path, asl / IMAGES[side] / f"{t_ns}.png")
-        (asl / TABLES[side]).write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in stamps))
-        (asl / YAMLS[side]).write_text(camera_yaml(CAMERA, T))
-    (asl / "mav0/imu0").mkdir()
-    (asl / "mav0/imu0/data.csv").write_text(imu_text(FRAMES))
-    (asl / "mav0/imu0/sensor.yaml").write_text(camera_yaml(CAMERA, np.eye(4)) + NOISE)
     poses = ((k, (START_NS + PERIOD_NS * k) / 1e9) for k in range(-1, FRAMES + 1))
     (asl / "truth.tum").write_text("".join(f"{t:.9f} 0 0 {0.05 * k} 0 0 0 1\n" for k, t in poses))
     return odometry.parent
@@ -364,7 +348,7 @@ def beside(case: Case) -> None:
     """Put an ASL folder's calibration beside a bag."""
     for sensor, T in zip(("cam0", "cam1", "imu0"), (*PLACES, np.eye(4)), strict=True):
         (case.at.parent / sensor).mkdir()
-        (case.at.parent / sensor / "sensor.yaml").write_text(camera_yaml(CAMERA, T) + NOISE)
+        (case.at.parent / sensor / "sensor.yaml").write_text(camera_yaml(CAMERA, T) + IMU_NOISE)
 
 
 def items(change: Callable[[Items], Items]) -> Step:
@@ -473,7 +457,6 @@ INTO, TOPICS = say(*IMPORT, "made"), lambda words: check("--topics", words)
 CHECKED = call(lambda at: check_runnable(load_sequence(str(at))))
 NAN = f"nan{6 * ',nan'}\n"
 OBJECTS = np.array([{}, []], dtype=object)
-SPECKLED = np.random.default_rng(0).integers(0, 255, (200, 320), dtype=np.uint8)
 P = "250 0 160 0 0 250 100 0 0 0 1 0"
 # Nine lists of ten, each of the one before it: 600 characters that stand for a billion values.
 BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
@@ -503,15 +486,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (put(time_stamps=np.zeros((2, 5))), "time_stamps has shape (2, 5)"),
         (put(time_stamps=np.zeros((1, 0))), "0 frame(s)"),
         (put(b=np.array(0.0)), "b is 0, expected a positive number"),
-        (put(b=np.array(np.nan)), "b is nan, expected a finite number"),
         (put(b=np.array([0.5, 0.5])), "b has 2 values, expected one finite number"),
-        (put(imu_T_cam=2.0 * np.eye(4)), "imu_T_cam is not a rotation"),
-        (put(K=np.full((3, 3), "x")), "K holds text, expected real numbers"),
         (put(K=np.full((3, 3), np.nan)), "K is not finite"),
         (put(features=many(400.0, 200.0, 380.0, 212.0, struck=0.375)), "in 38% of 40 sightings vL - vR is"),
         (put(features=many(200.0, 400.0, 200.0, 380.0, struck=0.375)), "u and v look exchanged"),
         (cut(0.1), "damaged or truncated npz"),
-        (write(save_struck), "damaged or truncated npz"),
         (write(save_short), "features ends after 57 of 60 values"),
         (both(put(Feature=1.0), gone("features")), "missing features (rename Feature?)"),
         (both(put(Feature=1.0), gone("features")), "without image features leave Feature out", gone("Feature")),
@@ -546,7 +525,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (put(v_t=np.array(["2026"], dtype="M8[Y]")), "an array holds datetime64"),
         (put(cam_imgs_L=[]), "cam_imgs_L has 0 images and drive.npy 5 timestamps"),
         (put(cam_imgs_R=None), "cam_imgs_R is missing or no list of images"),
-        (put(cam_imgs_L=[SPECKLED] * FRAMES, cam_imgs_R=[SPECKLED] * FRAMES), "and right images are the same ones"),
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
         (say("check-data", "@/../drive_imgs.npy"), "name the file beside it without _imgs"),
         (put(extR_T_imu=T_REGULAR_OPTICAL @ se3_exp(0.3 * np.ones(6))), "no pair; rectify the recording"),
@@ -571,11 +549,9 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     "export": [
         (gone("calib.json", "imu.csv"), "missing calib.json, imu.csv"),
         (document("calib.json", lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
-        (document("calib.json", lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds text"),
         (text("calib.json", '{"cam0": '), "correct this line, or copy the file again"),
         (text("calib.json", '["cam0"]'), "holds no 'key: value'"),
         (edit("features.csv", "uL,vL", "u,v"), "missing column uL (rename u?), vL"),
-        (edit("features.csv", "300", "many"), "features.csv: line 2: uL is many, expected a number"),
         (edit("imu.csv", "0.1,0.2,0.3,1,2,9.8\n", "0.1\n"), "imu.csv: line 2 has 2 columns, expected 7"),
         (text("imu.csv", gzip.compress(bytes(99))[:20]), "damaged or truncated gzip"),
         (lines("imu.csv", lambda table: table[:1]), "imu.csv: holds no rows"),
@@ -608,7 +584,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (edit("rig.toml", "fx_px = ", "f_px = "), "there is no f_px; did you mean fx_px"),
         (edit("rig.toml", "fx_px = ", f"fx_px = 1{400 * '0'} #"), "fx_px is inf, expected a finite number"),
         (edit("rig.toml", "T_imu_cam = [[", "T_imu_cam = [[{}], ["), "T_imu_cam holds text, expected real numbers"),
-        (edit("rig.toml", "T_imu_cam = [[", "T_imu_cam = [[1, 2, 3, 4], ["), "T_imu_cam has shape (5, 4)"),
         (edit("rig.toml", "cy_px = ", "cy_px = '"), "is not TOML"),
         (edit("rig.toml", "gyro_random_walk", "#"), "missing noise.gyro_random_walk; an IMU's data sheet has them"),
         (kept(tracks=OWN["tracks"] | {"uL": [1.0]}), "tracks: its columns differ in length: t_ns", kept()),
@@ -733,7 +708,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "1 poses for 5 images; cut both alike, or take the poses of this sequence",
         ),
         (text("times.txt", "0\n0.1\nx\n"), "times.txt: line 3 is not numeric"),
-        (text("times.txt", "".join(f"{k}00000000\n" for k in range(FRAMES))), "look like nanoseconds: divide by 1e9"),
         (text("times.txt", ""), "times.txt has one number a line, in seconds"),
         (both(text("x", b""), say("check-data", "@/x")), "the file is empty"),
         (both(text("x", b"hello"), say("check-data", "@/x")), "of no known format; there are"),
@@ -784,7 +758,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say("tracks", "@", "--out", "@/calib.txt/x"), "choose another directory with --out"),
     ],
     "day": [
-        (edit("calib_imu_to_velo.txt", "T: 0 0 0", "T: 0 O 0"), "T holds text, expected real numbers"),
         (gone(f"{DAY}/image_00/timestamps.txt"), "timestamps.txt: cannot be read"),
         (text(f"{DAY}/image_00/timestamps.txt", "\n\n"), "holds no stamps"),
         (text(f"{DAY}/oxts/data/0000000003.txt", "1 2 3"), "0000000003.txt: 3 numbers"),

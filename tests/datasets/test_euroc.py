@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.frontend.conftest import camera_yaml as yaml_of
+from tests.frontend.conftest import IMU_NOISE, camera_yaml, write_asl
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.errors import DataError
@@ -22,6 +22,10 @@ from toolkit.sequence import Sequence
 # As large as today's stamps, and no multiple of what a double can tell apart.
 START_NS = 1_403_715_273_262_142_977
 AXIS = np.array([0.6, 0.0, 0.8])
+CAMERA, TRUTH = (
+    Camera((458.0, 457.0, 367.0, 248.0), "none", np.zeros(4), (752, 480)),
+    "mav0/state_groundtruth_estimate0/data.csv",
+)
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z"
 )
@@ -55,39 +59,18 @@ def truth_text(t_s: Array, R_world_imu: Array) -> str:
     return f"#timestamp,{POSE},{MOTION}\n" + rows_of(t_s, position, w_first, rest)
 
 
-def camera_yaml(T_body_sensor: Array) -> str:
-    pinhole_px = (458.0, 457.0, 367.0, 248.0)
-    return yaml_of(Camera(pinhole_px, "none", np.zeros(4), (752, 480)), T_body_sensor)
-
-
-def imu_yaml(T_body_imu: Array) -> str:
-    return camera_yaml(T_body_imu) + (
-        "gyroscope_noise_density: 1.6968e-04     # [ rad / s / sqrt(Hz) ]\ngyroscope_random_walk: 1.9393e-05\n"
-        "accelerometer_noise_density: 2.0000e-3\naccelerometer_random_walk: 3.0000e-3\n"
-    )
-
-
-def write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-
-
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Return an ASL folder of 3 s; the truth covers the time from 0.5 to 2.5 s."""
     root = tmp_path / "swing"
     t_s = np.arange(0.0, 3.0, 0.005)
     gyro = np.cos(2.0 * t_s)[:, None] * AXIS + [0.01, 0.02, 0.03]
-    write(root / "mav0/imu0/data.csv", f"{IMU_HEADER}\n" + rows_of(t_s, gyro, np.tile([1.0, 2.0, 9.81], (t_s.size, 1))))
-    write(root / "mav0/imu0/sensor.yaml", imu_yaml(np.eye(4)))
-    write(root / "mav0/cam0/sensor.yaml", camera_yaml(T_IMU_CAM0))
-    write(root / "mav0/cam1/sensor.yaml", camera_yaml(T_IMU_CAM1))
-    frames = START_NS + 1_250_000 + 50_000_000 * np.arange(60)
-    write(
-        root / "mav0/cam0/data.csv", "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in frames.tolist())
-    )
+    write_asl(root, CAMERA, [T_IMU_CAM0, T_IMU_CAM1], [START_NS + 1_250_000 + 50_000_000 * k for k in range(60)])
+    motion = rows_of(t_s, gyro, np.tile([1.0, 2.0, 9.81], (t_s.size, 1)))
+    (root / "mav0/imu0/data.csv").write_text(f"{IMU_HEADER}\n{motion}")
     truth_s = np.arange(0.5, 2.5, 0.005)
-    write(root / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
+    (root / TRUTH).parent.mkdir()
+    (root / TRUTH).write_text(truth_text(truth_s, orientations(truth_s)))
     return root
 
 
@@ -130,13 +113,13 @@ def test_motion_calibration_and_noise_land_in_their_fields(recording: Path) -> N
 
 def test_extrinsics_are_made_relative_to_an_imu_that_is_not_the_body(recording: Path) -> None:
     T_body_imu = se3(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, 0.2, 0.3]))
-    (recording / "mav0/imu0/sensor.yaml").write_text(imu_yaml(T_body_imu))
+    (recording / "mav0/imu0/sensor.yaml").write_text(camera_yaml(CAMERA, T_body_imu) + IMU_NOISE)
     rig = load_sequence(str(recording)).rig
     np.testing.assert_allclose(rig.T_imu_cam, se3_inverse(T_body_imu) @ T_IMU_CAM0, atol=1e-10)
 
 
 def test_a_wrong_row_of_a_truth_is_named_as_an_editor_counts_it(recording: Path) -> None:
-    file = recording / "mav0/state_groundtruth_estimate0/data.csv"
+    file = recording / TRUTH
     heading, *rows = file.read_text().splitlines()
     rows[1] = rows[0]  # the same stamp
     file.write_text("\n".join(["# Of a program.", "", heading, "", *rows]))
@@ -147,7 +130,7 @@ def test_a_wrong_row_of_a_truth_is_named_as_an_editor_counts_it(recording: Path)
 def test_a_truth_of_another_body_is_moved_to_the_imu(recording: Path) -> None:
     before = load_sequence(str(recording)).truth
     T_body_sensor = se3(so3_exp(np.array([0.0, 0.0, 0.4])), np.array([0.1, 0.0, -0.2]))
-    (recording / "mav0/state_groundtruth_estimate0/sensor.yaml").write_text(camera_yaml(T_body_sensor))
+    (recording / "mav0/state_groundtruth_estimate0/sensor.yaml").write_text(camera_yaml(CAMERA, T_body_sensor))
     after = load_sequence(str(recording)).truth
     np.testing.assert_allclose(after.T_world_imu[::10] @ T_body_sensor, before.T_world_imu[::10], atol=1e-9)
     assert after.v_world is None
@@ -169,7 +152,7 @@ def test_frames_lie_inside_the_truth_which_is_interpolated_there(recording: Path
 
 def test_no_frame_lies_in_a_gap_of_the_truth(recording: Path) -> None:
     truth_s = np.concatenate([np.arange(0.5, 1.0, 0.005), np.arange(1.5, 2.5, 0.005)])
-    write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
+    (recording / TRUTH).write_text(truth_text(truth_s, orientations(truth_s)))
     t_s = (load_sequence(str(recording)).frames_t_ns - START_NS) / 1e9
     assert not ((t_s > 0.995) & (t_s < 1.5)).any()
     assert ((t_s < 0.99).sum(), (t_s > 1.5).sum()) == (10, 20)
@@ -178,8 +161,8 @@ def test_no_frame_lies_in_a_gap_of_the_truth(recording: Path) -> None:
 def test_of_two_truths_the_one_that_turns_as_the_gyro_says_is_used(recording: Path) -> None:
     truth_s = np.arange(0.5, 2.5, 0.005)
     good, turned = orientations(truth_s), orientations(truth_s) @ TURNED
-    write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, turned))
-    write(recording / "again.csv", truth_text(truth_s, good))
+    (recording / TRUTH).write_text(truth_text(truth_s, turned))
+    (recording / "again.csv").write_text(truth_text(truth_s, good))
     sequence = load_sequence(str(recording))
     assert sequence.provenance.facts[1].startswith("the truth is again.csv, the better")
     t_s = (sequence.frames_t_ns - START_NS) / 1e9

@@ -46,6 +46,9 @@ def along(k: int, speed_m: float = 0.015) -> Array:
     return se3(np.eye(3), -k * speed_m * np.array([1.0, 0.2, 0.4]))
 
 
+# Of EuRoC's IMU, in the units of its sensor.yaml.
+IMU_NOISE = "gyroscope_noise_density: 1.6968e-04     # [ rad / s / sqrt(Hz) ]\ngyroscope_random_walk: 1.9393e-05\n"
+IMU_NOISE += "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
 Pair = tuple[Image, Image]
 FRAMES = 10
 START_NS, PERIOD_NS = 1_403_715_273_262_142_976, 50_000_000
@@ -145,6 +148,18 @@ def imu_text(frames: int) -> str:
     return f"#timestamp [ns],{columns}\n" + "".join(f"{t},{','.join(f'{x:.9g}' for x in row)}\n" for t, row in rows)
 
 
+def write_asl(root: Path, camera: Camera, T_imu_cams: list[Array], stamps_ns: list[int]) -> None:
+    """Write an ASL folder of alike cameras with the IMU's motion, and folders for the images."""
+    table = "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in stamps_ns)
+    for side, T in enumerate(T_imu_cams):
+        (root / f"mav0/cam{side}/data").mkdir(parents=True)
+        (root / f"mav0/cam{side}/data.csv").write_text(table)
+        (root / f"mav0/cam{side}/sensor.yaml").write_text(camera_yaml(camera, T))
+    (root / "mav0/imu0").mkdir()
+    (root / "mav0/imu0/data.csv").write_text(imu_text(len(stamps_ns)))
+    (root / "mav0/imu0/sensor.yaml").write_text(camera_yaml(camera, np.eye(4)) + IMU_NOISE)
+
+
 def positions(frames: range) -> Array:
     """Return where the IMU is (N, 3) m at frames, in a world whose axes are the IMU's at the first."""
     moved = -np.stack([along(k)[:3, 3] for k in frames])
@@ -156,20 +171,10 @@ def asl_template(raw: dict[str, list[Pair]], tmp_path_factory: pytest.TempPathFa
     """Return an ASL folder with real lenses' images, an IMU and a truth."""
     root = tmp_path_factory.mktemp("film") / "film"
     stamps = [START_NS + PERIOD_NS * k for k in range(FRAMES)]
-    names = [f"{t}.png" for t in stamps]
-    T_imu_right = T_IMU_LEFT @ np.linalg.inv(T_RIGHT_LEFT)
-    for side, (name, T) in enumerate((("cam0", T_IMU_LEFT), ("cam1", T_imu_right))):
-        (root / "mav0" / name / "data").mkdir(parents=True)
-        for pair, file in zip(raw["radtan"], names, strict=True):
-            cv2.imwrite(str(root / "mav0" / name / "data" / file), pair[side])
-        rows = "".join(f"{t},{file}\n" for t, file in zip(stamps, names, strict=True))
-        (root / "mav0" / name / "data.csv").write_text("#timestamp [ns],filename\n" + rows)
-        (root / "mav0" / name / "sensor.yaml").write_text(camera_yaml(RADTAN, T))
-    (root / "mav0/imu0").mkdir()
-    (root / "mav0/imu0/data.csv").write_text(imu_text(FRAMES))
-    densities = "gyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-05\n"
-    densities += "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
-    (root / "mav0/imu0/sensor.yaml").write_text(camera_yaml(PLAIN, np.eye(4)) + densities)
+    write_asl(root, RADTAN, [T_IMU_LEFT, T_IMU_LEFT @ np.linalg.inv(T_RIGHT_LEFT)], stamps)
+    for t_ns, pair in zip(stamps, raw["radtan"], strict=True):
+        for side, image in enumerate(pair):
+            cv2.imwrite(str(root / f"mav0/cam{side}/data/{t_ns}.png"), image)
     # Seconds as doubles are off by 1e-7: the truth begins before the first frame and ends behind the last.
     frames = range(-1, FRAMES + 1)
     rows = zip((START_NS + PERIOD_NS * k for k in frames), positions(frames).tolist(), strict=True)
