@@ -77,6 +77,12 @@ def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise():
         medians.append(values["heldout_reproj_median_px"])
     assert medians[0] < 1e-9  # rounding of 1e3 px
     assert all(1.5 * small < large for small, large in itertools.pairwise(medians))
+    withheld = tracks_of(replace(sequence, observations=sequence.held_out), poses)
+    predicted_px, in_front = predict_left_out(*withheld, RIG)
+    assert in_front.all()
+    errors_px = np.minimum(np.sqrt(np.mean((withheld[1] - predicted_px) ** 2, axis=1)), CAP_PX)
+    assert values["heldout_reproj_median_px"] == pytest.approx(np.median(errors_px), rel=1e-9)  # the same numbers
+    assert values["heldout_reproj_rmse_px"] == pytest.approx(np.sqrt(np.mean(errors_px**2)), rel=1e-9)
 
 
 def tracks_of(sequence, poses):
