@@ -17,16 +17,18 @@ import argparse
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from toolkit.errors import VislamError
+from toolkit.gate.interleaved import unpacked
 
 PROJECT = Path(__file__).resolve().parents[2]
 CHILD = Path(__file__).with_name("same_answers_child.py")
@@ -40,10 +42,6 @@ ESTIMATORS = (
 )  # fmt: skip
 INPUT = "(input)"
 Answers = dict[str, Any]
-
-
-class UnrunnableError(Exception):
-    """A tree whose estimators could not be run; the text has its standard error."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +98,6 @@ def answers_of(answers: Answers, sequence: str, estimator: str) -> Answers:
     return {key.removeprefix(prefix): value for key, value in answers.items() if key.startswith(prefix)}
 
 
-def unpacked(revision: str, folder: Path) -> Path:
-    """Unpack the packages of a git revision into a folder."""
-    command = ["git", "-C", str(PROJECT), "archive", revision, "toolkit", "filters"]
-    done = subprocess.run(command, capture_output=True, check=False)
-    if done.returncode:
-        raise UnrunnableError(f"{revision}: {done.stderr.decode().strip()}")
-    with tarfile.open(fileobj=BytesIO(done.stdout)) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
-
-
 def run_tree(tree: Path, sequence: str, wanted: argparse.Namespace) -> Answers:
     """Return what the estimators of a tree answer on a sequence, from a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
@@ -120,7 +107,7 @@ def run_tree(tree: Path, sequence: str, wanted: argparse.Namespace) -> Answers:
         environment = {**os.environ, "PYTHONPATH": str(tree), "VISLAM_CACHE": folder}
         done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise UnrunnableError(f"{sequence} in {tree}:\n{done.stderr}")
+            raise VislamError(f"{sequence} in {tree}:\n{done.stderr}")
         return read(out)
 
 
@@ -148,7 +135,7 @@ def print_comparison(old: Answers, new: Answers, wanted: argparse.Namespace) -> 
         for estimator in (INPUT, *wanted.estimators):
             before = answers_of(old, sequence, estimator)
             if not before:
-                raise UnrunnableError(f"{sequence} {estimator}: the saved answers have none of it")
+                raise VislamError(f"{sequence} {estimator}: the saved answers have none of it")
             kinds = dict(compared(before, answers_of(new, sequence, estimator)))
             beyond = [kind for kind, found in kinds.items() if not found.relative <= wanted.tolerance]
             failed = str(before.get("status")) == "failed"  # then there is nothing to compare
@@ -186,17 +173,17 @@ def main(words: list[str]) -> int:
     """Run what is asked for; return the exit status."""
     wanted = parsed(words)
     try:
-        with tempfile.TemporaryDirectory() as folder:
+        with ExitStack() as stack:
             trees = {} if wanted.save else {"new": PROJECT}
             if wanted.revision is not None:
-                trees["old"] = unpacked(wanted.revision, Path(folder))
+                (trees["old"],) = stack.enter_context(unpacked(wanted.revision))
             found = run_trees(trees, wanted)
         if wanted.save:
             np.savez_compressed(wanted.save, **found["old"])
             return 0
         old = read(wanted.against_saved) if wanted.against_saved else found["old"]
         return 0 if print_comparison(old, found["new"], wanted) else 1
-    except UnrunnableError as reason:
+    except VislamError as reason:
         print(reason, file=sys.stderr)
         return 2
 

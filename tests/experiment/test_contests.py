@@ -19,7 +19,7 @@ from toolkit.experiment.contests import (
     less_over_seeds,
     too_far,
 )
-from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import Outcome, Scored, Unit, outcome_of, run_estimator
 from toolkit.geometry import Array, about_z, se3, se3_exp
 from toolkit.metrics import Scores
@@ -163,12 +163,8 @@ def test_without_a_covariance_or_over_seeds_nobody_parts():
 
 def rows_of(sequence: Sequence, noise: Noise) -> list[Row]:
     prepared = prepare(Recording(replace(sequence, truth=None), noise=noise))
-    return [_row_of(name, prepared) for name in NAMES]
-
-
-def _row_of(name: str, prepared: Prepared) -> Row:
-    run = run_estimator(Unit(prepared, 0, name), prepared, SILENT)
-    return Row("causal", (outcome_of(run, prepared.sequence, 0),))
+    runs = (run_estimator(Unit(prepared, 0, name), prepared, SILENT) for name in NAMES)
+    return [Row("causal", (outcome_of(run, prepared.sequence, 0),)) for run in runs]
 
 
 def test_an_odometer_that_slips_parts_from_estimators_that_see_it_and_a_sound_one_from_nobody():

@@ -25,6 +25,7 @@ from toolkit.settings.reading import settings_of
 
 PROJECT = Path(__file__).parents[2]
 TWO = ("dead-reckoning", "ekf")
+TIMES = ("frame_", "total_s", "cpu_s", "peak_rss")
 Sweep = Callable[..., Comparison]
 
 
@@ -75,17 +76,13 @@ def answers(comparison: Comparison) -> list[object]:
     """Return all that a comparison found, the times left out."""
     document = msgspec.to_builtins(seeds_document(comparison))
     for run in document["runs"]:
-        run["metrics"] = {key: value for key, value in run["metrics"].items() if not _is_time(key)}
+        run["metrics"] = {key: value for key, value in run["metrics"].items() if not key.startswith(TIMES)}
     series = [
         (output, one.nees_pose.tobytes(), one.position_m.tobytes(), one.nis_dof)
         for outcome in comparison.outcomes
         for output, one in outcome.outputs.items()
     ]
     return [document, series]
-
-
-def _is_time(key: str) -> bool:
-    return key.startswith(("frame_", "total_s", "cpu_s", "peak_rss"))
 
 
 @pytest.mark.parametrize(("ended", "torn"), [(0, b""), (1, b'{"schema":"vislam.outcome/2","unit":{"da'), (3, b"{")])

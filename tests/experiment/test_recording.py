@@ -26,14 +26,6 @@ def messages(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
     return sequence.rig.cov_uv_px2, sequence.noise
 
 
-@pytest.mark.parametrize("source", ["drive", "drive-imu"])
-def test_without_settings_the_noise_is_the_recordings(source):
-    recorded = load_sequence(source)
-    cov_uv_px2, noise = messages(source)
-    np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
-    assert noise == recorded.noise
-
-
 def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results():
     slipping = faults.disturbed_motion(simulate(replace(SCENARIOS["drive"], duration_s=12.0), 0), 2.0)  # at 5 to 10 s
     for part, concerned in ((Part(), True), (Part(to_s=4.0), False), (Part(from_s=9.0), True)):
@@ -42,12 +34,15 @@ def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results():
         assert ("none of it is in the part that is run" in conflict.detail) is not concerned
 
 
-def test_a_factor_scales_white_noise_and_no_random_walk():
+def test_without_settings_the_noise_is_the_recordings_and_a_factor_scales_white_noise_and_no_random_walk():
     for source, densities in (
         ("drive", ("velocity_noise_density", "gyro_noise_density")),
         ("drive-imu", ("gyro_noise_density", "accel_noise_density")),
     ):
-        before, (_, after) = load_sequence(source).noise, messages(source, motion_scale=3.0)
+        recorded, (_, after) = load_sequence(source), messages(source, motion_scale=3.0)
+        cov_uv_px2, before = messages(source)
+        np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
+        assert before == recorded.noise
         for name, value in vars(before).items():
             np.testing.assert_array_equal(getattr(after, name), (3.0 if name in densities else 1.0) * value)
 

@@ -183,16 +183,6 @@ def test_frames_that_got_lost_fail_however_good_the_rest(baseline):
     assert findings(checked(baseline, [lost, recorded])) == [("flight", "two", COVERAGE, "regressed")]
 
 
-def test_other_measurements_are_not_compared(baseline):
-    simulated, recorded = as_measured(baseline)
-    other = replace(
-        simulated, hashes=("other", *simulated.hashes[1:]), fingerprints=("other", *simulated.fingerprints[1:])
-    )
-    check = checked(baseline, [other, recorded])
-    assert findings(check) == [("flight", "", "sequence", "missing")]
-    assert "under seed 0" in check.failing[0].words
-
-
 def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseline):
     simulated, recorded = as_measured(baseline)
     check = checked(baseline, [replace(simulated, hashes=("other", *simulated.hashes[1:])), recorded])
