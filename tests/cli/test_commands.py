@@ -5,10 +5,10 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.report.test_html_report import embedded
 from toolkit import audit
 from toolkit.audit import Audit, Finding
 from toolkit.cli import progress_display
@@ -19,13 +19,6 @@ pytestmark = pytest.mark.usefixtures("unrendered")
 
 # Nobody looks at the figures here: drawing them takes as long as all else.
 QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
-
-
-def payload_of(page: Path) -> list[dict[str, Any]]:
-    text = page.read_text(encoding="utf-8")
-    (found,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', text, flags=re.S)
-    cases: list[dict[str, Any]] = json.loads(found)["cases"]
-    return cases
 
 
 def test_several_sequences_get_a_directory_each_and_take_the_place_of_an_earlier_run(vislam):
@@ -84,13 +77,13 @@ def test_a_run_directory_over_seeds(vislam, capsys, monkeypatch):
 def test_several_runs_and_runs_over_seeds_make_one_page_beside_them(vislam):
     assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "all") == 0
     assert vislam("report", "all/drive", "all/drive-imu", "all/drive") == 0
-    titles = [case["title"] for case in payload_of(Path("report.html"))]
+    titles = [case["title"] for case in embedded(Path("report.html").read_text())["cases"]]
     assert titles == ["drive (all/drive)", "drive-imu", "drive (all/drive)"]
     assert vislam("report", "all") == 0
-    assert [case["title"] for case in payload_of(Path("all/report.html"))] == ["drive", "drive-imu"]
+    assert [case["title"] for case in embedded(Path("all/report.html").read_text())["cases"]] == ["drive", "drive-imu"]
     assert vislam("compare", "drive", *QUICK, "--seeds", "2", "--out", "seeds") == 0
     assert vislam("report", "seeds", "all/drive", "--out", "pages/both.html") == 0
-    assert [case["kind"] for case in payload_of(Path("pages/both.html"))] == ["seeds", "run"]
+    assert [case["kind"] for case in embedded(Path("pages/both.html").read_text())["cases"]] == ["seeds", "run"]
     Path("all/drive/manifest.json").unlink()  # nothing is left out in silence
     assert vislam("report", "all") == 3
 

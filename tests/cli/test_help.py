@@ -1,5 +1,6 @@
-"""Help is quick, complete, and its examples work."""
+"""Help is quick, complete, and its examples work; a shell completes what is typed (5 s)."""
 
+import os
 import re
 import shlex
 import shutil
@@ -12,7 +13,7 @@ import pytest
 
 from tests.datasets.test_own_tables import recorded, written
 from toolkit import cli
-from toolkit.cli import arguments, recordings, runs
+from toolkit.cli import arguments, main, recordings, runs
 
 COMMANDS = ("", *(command.name for command in cli._COMMANDS))
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
@@ -59,3 +60,34 @@ def test_what_the_help_repeats_is_what_there_is():
     assert set(recordings.SCENARIOS) == set(SCENARIOS)
     repeated = (runs.FORMATS, arguments.TOPIC_ROLES, arguments.COV_CONVENTIONS)
     assert repeated == (tuple(FORMATS), tuple(ROLES), tuple(CONVENTIONS))
+
+
+# Completion -----------------------------------------------------------------------------------------------------------
+
+OFFERED = {
+    "comp": ["compare", "completion"],
+    "evaluate --format m": ["markdown"],
+    "compare --estimators ekf,msckf-s": ["ekf,msckf-slam"],
+    "compare fli": ["flight", "flight-realistic"],
+    "compare --set noise.pix": ["noise.pixel_sigma_px="],
+    "report no": ["notes.txt"],  # files
+}
+
+
+@pytest.mark.parametrize("line", OFFERED)
+def test_what_is_offered_for_the_last_word_of_a_line(line, tmp_path):
+    (tmp_path / "notes.txt").touch()
+    asked = {"COMP_LINE": f"vislam {line}", "COMP_POINT": str(len(f"vislam {line}")), "_ARGCOMPLETE": "1"}
+    asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "offered"), "_ARGCOMPLETE_IFS": "\n"}
+    asked |= {"PYTHONPATH": str(Path(__file__).parents[2])}
+    subprocess.run([sys.executable, "-m", "toolkit.cli"], env=os.environ | asked, cwd=tmp_path, check=False)
+    assert sorted(word.strip() for word in (tmp_path / "offered").read_text().splitlines()) == OFFERED[line]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_of_a_shell_is_whole(shell, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "vislam" in script
+    if shutil.which(shell):
+        subprocess.run([shell, "-n"], input=script, text=True, check=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.report.test_html_report import embedded
 from toolkit.cli import main
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.report.records import read_metrics, read_report
@@ -106,9 +107,8 @@ def test_another_system_is_in_everything_a_comparison_leaves(again):
     ]
     assert "by euroc" in {run.estimator for run in read_report(again / "report.json").runs}
     assert main(["report", str(again)]) == 0
-    page = (again / "report.html").read_text()
-    (payload,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', page, flags=re.S)
-    (row,) = [row for row in json.loads(payload)["cases"][0]["rows"] if row["estimator"] == "by euroc"]
+    (case,) = embedded((again / "report.html").read_text())["cases"]
+    (row,) = [row for row in case["rows"] if row["estimator"] == "by euroc"]
     assert row["metrics"]["total_s"] is None
 
 

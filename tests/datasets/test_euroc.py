@@ -12,6 +12,7 @@ import pytest
 from tests.frontend.conftest import IMU_NOISE, camera_yaml, write_asl
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
+from toolkit.datasets.io.fields import read_fields
 from toolkit.errors import DataError
 from toolkit.frontend import Camera
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
@@ -235,3 +236,9 @@ def test_the_noise_covers_what_the_real_imu_and_the_truth_differ_by_between_fram
 def test_the_recomputed_truth_of_v1_01_is_chosen_over_the_original(real: Callable[[str], Path]) -> None:
     sequence = loaded(real("euroc/V1_01_easy"))
     assert sequence.provenance.facts[1].startswith("the truth is ground_truth_recomputed_20hz.csv, the better")
+
+
+def test_a_rig_of_many_cameras_may_share_what_they_have(tmp_path: Path) -> None:
+    shared = "".join(f"cam{i}:\n  T: *T\n  resolution: *size\n" for i in range(1, 9))
+    (tmp_path / "rig.yaml").write_text(f"cam0:\n  T: &T [[1, 0], [0, 1]]\n  resolution: &size [3, 2]\n{shared}")
+    np.testing.assert_array_equal(read_fields(tmp_path / "rig.yaml").arrays["cam8.T"], np.eye(2))

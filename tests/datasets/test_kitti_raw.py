@@ -11,7 +11,7 @@ from toolkit.datasets import load_sequence
 from toolkit.geometry import se3
 from toolkit.motion_samples import ImuSamples, TwistSamples
 
-FRAMES, STEP_M, SPEED_MPS = 8, 0.05, 0.5
+FRAMES, SPEED_MPS = 8, 0.5
 DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"
 # The camera looks along the IMU's x and stands 0.3 m before and 0.1 m above it.
 R_CAM_IMU = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

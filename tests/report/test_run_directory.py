@@ -7,27 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from toolkit.errors import OutputError
 from toolkit.experiment.comparison import Comparison
 from toolkit.files.writing import check_replaceable
 from toolkit.report import figures, run_directory
-from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import MadeBy, write_run, written_by_us
 from toolkit.report.scores import metrics_document
 
-# Where it does not matter which figures there are, and what is in their files.
-one_figure = pytest.mark.usefixtures("one_figure")
-
-
-@pytest.fixture(name="one_figure")
-def _one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have an empty figure stand for all there are: to draw them takes longer than to write all else."""
-    monkeypatch.setattr(
-        figures, "drawn", lambda _comparison, _choice: [NamedFigure("top_all", "From above.", Figure())]
-    )
+# Where it does not matter what is in the files of figures.
+unrendered = pytest.mark.usefixtures("unrendered")
 
 
 def write(comparison: Comparison, target: Path) -> None:
@@ -73,7 +63,7 @@ def test_a_failure_while_writing_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@one_figure
+@unrendered
 def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, tmp_path: Path) -> None:
     target = tmp_path / "run"
     write(comparison, target)
@@ -92,7 +82,7 @@ def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, t
 @pytest.mark.parametrize(
     "name", ["notes.txt", "figures/top_view.png", "raw/imu.csv", "trajectories/other.tum", "report.html", "report.md"]
 )
-@one_figure
+@unrendered
 def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
     comparison: Comparison, tmp_path: Path, name: str
 ) -> None:
@@ -124,7 +114,7 @@ def test_what_is_not_ours_is_refused(tmp_path: Path, name: str) -> None:
     assert file.read_text() == "{}"
 
 
-@one_figure
+@unrendered
 @pytest.mark.parametrize("meanwhile", ["an interrupt between the renames", "a file of the user's own"])
 def test_an_earlier_run_stays_where_the_next_cannot_take_its_place(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, meanwhile: str
