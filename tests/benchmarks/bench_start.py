@@ -29,11 +29,12 @@ IMPORTS = (
     "import toolkit.cli",
     "from toolkit.registry import discover; [one.load() for one in discover().values()]",
 )
-RUNS = ("ekf", "msckf-fej")
 RUN = """
 import toolkit
 toolkit.compare("drive", ["{name}"], max_frames=3, workers=1)
 """
+# What is timed, by what is printed of it.
+PROGRAMS = {line: line for line in IMPORTS} | {name: RUN.format(name=name) for name in ("ekf", "msckf-fej")}
 
 
 def cpu_s(program: str, changed: Mapping[str, str]) -> float:
@@ -45,18 +46,12 @@ def cpu_s(program: str, changed: Mapping[str, str]) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def programs() -> dict[str, str]:
-    """Return the programs to time, by what is printed of them."""
-    return {**{line: line for line in IMPORTS}, **{name: RUN.format(name=name) for name in RUNS}}
-
-
 def measure(repeats: int) -> None:
     """Print a line for each program: its time over the reference's of the same turn, mean and standard error."""
-    timed = programs()
-    for program in timed.values():  # what is imported is compiled and read once
+    for program in PROGRAMS.values():  # what is imported is compiled and read once
         cpu_s(program, {})
-    turns = [{name: cpu_s(program, {}) for name, program in timed.items()} for _ in range(repeats)]
-    for name in timed:
+    turns = [{name: cpu_s(program, {}) for name, program in PROGRAMS.items()} for _ in range(repeats)]
+    for name in PROGRAMS:
         ratios = np.array([turn[name] / turn[REFERENCE] for turn in turns])
         error = ratios.std(ddof=1) / np.sqrt(repeats) if repeats > 1 else np.nan
         print(f"{ratios.mean():8.2f} +- {error:.2f}  {np.mean([turn[name] for turn in turns]):7.2f} s  {name}")

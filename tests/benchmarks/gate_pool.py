@@ -82,8 +82,9 @@ def scores(run: Run, sequence: Sequence, percent: float) -> dict[str, dict[str, 
     return found
 
 
-def one_seed(source: str, duration_s: float, seed: int, estimators: tuple[str, ...]) -> dict[str, object]:
+def one_seed(requested: tuple[str, float, int, tuple[str, ...]]) -> dict[str, object]:
     """Run every estimator on both sides and with its plants; return metrics by estimator and side, and its time."""
+    source, duration_s, seed, estimators = requested
     sequence = audit(simulate(replace(SCENARIOS[source], duration_s=duration_s), seed)).sequence
     prior = start_from_measurements(sequence)
     found: dict[str, object] = {"source": source, "duration_s": duration_s, "seed": seed}
@@ -133,17 +134,13 @@ def _louder(noise: MotionNoise, factor: float) -> MotionNoise:
     return replace(noise, **{name: factor * getattr(noise, name) for name in white})
 
 
-def _one(given: tuple[str, float, int, tuple[str, ...]]) -> dict[str, object]:
-    return one_seed(*given)
-
-
 def fill(pool: Path, cases: dict[str, float], seeds: range, estimators: tuple[str, ...], processes: int) -> None:
     """Append a line of JSON for each seed of each case to the pool; may be interrupted."""
     from multiprocessing import get_context
 
     work = [(source, duration_s, seed, estimators) for seed in seeds for source, duration_s in cases.items()]
     with get_context("spawn").Pool(processes) as side_by_side, pool.open("a", encoding="utf-8") as lines:
-        for found in side_by_side.imap_unordered(_one, work):
+        for found in side_by_side.imap_unordered(one_seed, work):
             lines.write(json.dumps(found) + os.linesep)
             lines.flush()
 

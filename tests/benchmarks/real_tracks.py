@@ -38,6 +38,7 @@ SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "smart", "isam2", "batch")
 METRICS = ("ate_se3_m", "ate_yaw_m", "ate_none_m", "kitti_t_percent", "nees_pose_mean", "nees_ori_mean")
 LONG_DRIVE = "0027"
+DATA = Path(os.environ.get("VISLAM_DATA", "../shared/data"))
 
 
 class Case(NamedTuple):
@@ -49,15 +50,10 @@ class Case(NamedTuple):
     model: str
 
 
-def data() -> Path:
-    """Return the folder of the recordings."""
-    return Path(os.environ.get("VISLAM_DATA", "../shared/data"))
-
-
 def drives() -> dict[str, Path]:
     """Return the recordings by their short names."""
-    short = {path.stem.split("_")[4] + path.stem[8:10]: path for path in sorted(data().glob("utias/*_sync_KLT.mat"))}
-    return {**short, LONG_DRIVE: data() / "ucsd/0027.npz"}
+    short = {path.stem.split("_")[4] + path.stem[8:10]: path for path in sorted(DATA.glob("utias/*_sync_KLT.mat"))}
+    return {**short, LONG_DRIVE: DATA / "ucsd/0027.npz"}
 
 
 def with_noisy_twists(sequence: Sequence, seed: int) -> Sequence:
@@ -81,23 +77,19 @@ def noise_of(model: str) -> Noise:
     return Noise(track_weight=named.get(weight) or float(weight), bridge_gaps="open" not in switches)
 
 
-def outliers_of(model: str) -> Outliers:
-    """Return the outlier policy that a model names, the default where it names none."""
-    return next((POLICIES[switch] for switch in model.split("+") if switch in POLICIES), Outliers())
-
-
 def prepared(drive: str, seed: int, model: str) -> Prepared:
     """Return a drive as estimators read it under a noise model."""
     source, noise = drives()[drive], noise_of(model)
     if drive == LONG_DRIVE:
-        return prepare(Recording(str(source), truth=data() / "ucsd/gt/0027.tum", noise=noise))
+        return prepare(Recording(str(source), truth=DATA / "ucsd/gt/0027.tum", noise=noise))
     clean = prepare(Recording(str(source), noise=Noise(track_weight=1.0, motion_scale=1.0))).whole
     return prepare(Recording(with_noisy_twists(clean, seed), noise=noise))
 
 
 def measured(case: Case, ready: Prepared) -> dict[str, Any]:
     """Run one case and return its line."""
-    settings = Settings(noise=noise_of(case.model), outliers=outliers_of(case.model))
+    policy = next((POLICIES[switch] for switch in case.model.split("+") if switch in POLICIES), Outliers())
+    settings = Settings(noise=noise_of(case.model), outliers=policy)
     began = time.process_time()
     result = run(case.estimator, find(case.estimator).load(), ready.sequence, ready.prior, settings=settings)
     line: dict[str, Any] = {**case._asdict(), "status": result.status, "cpu_s": time.process_time() - began}

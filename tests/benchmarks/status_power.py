@@ -22,7 +22,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -208,14 +208,10 @@ def ended(draw: int, scenario: Scenario) -> Iterator[Ended]:
             outcome = outcome_of(run, prepared.sequence, 0)
             rows[name] = [row for row in (Row(output, (outcome,)) for output in OUTPUTS) if not row.repeats_causal]
             lines[name] = _scored(one, run, outcome, prepared, replace(prepared.sequence, truth=recorded.truth))
-    contradicting = {name for names in comparisons(scenario) for name in _far_from_motion(rows, names)}
+    compared = [[row for name in names for row in rows.get(name, ())] for names in comparisons(scenario)]
+    contradicting = {one.row.estimator for of_some in compared for one in too_far(of_some)}
     for name, line in lines.items():
         yield replace(line, contradicts=name in contradicting)
-
-
-def _far_from_motion(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
-    """Return of the estimators of a comparison who is too far from the measured motion."""
-    return {one.row.estimator for one in too_far(row for name in names for row in rows.get(name, ()))}
 
 
 def _unless_refused(make: Callable[[], Result]) -> Result | str:
