@@ -94,7 +94,6 @@ def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan):
         (lambda: Trial.of("ekf", faults={"standstill": 1.0}), DataError, "can be planted between twists only"),
         (lambda: Trial.of("ekf", faults={"frame_jitter": -1.0}), DataError, "a dose of -1 s cannot be planted"),
         (lambda: Trial.of("ekf", faults={"blackout": np.inf}), SettingsError, "give a finite dose, in s"),
-        (lambda: Trial.of("ekf", faults={"few_tracks": np.nan}), SettingsError, "give a finite dose, in tracks"),
         (lambda: Trial.of("ekf", faults={"outlier_tracks": -0.5}), SettingsError, "give a share from 0 to 1"),
     ],
 )

@@ -22,7 +22,7 @@ from toolkit.settings import SettingsError
 from toolkit.settings.reading import settings_of
 
 SEEDS = 6
-FRAMES, TURNED = "fault:dropped_frames", "fault:turned_camera"
+FRAMES = "fault:dropped_frames"
 
 
 def outcome(seed: int, ate_m: float | None, drift_m: np.ndarray | None = None) -> Outcome:
@@ -169,16 +169,14 @@ def test_functions_of_ones_own_are_swept_beside_what_is_named(short):
     assert (one.over_clean, one.nees) == (same.over_clean, same.nees)
 
 
+# What an advice mends is in tests/cli/test_advice.py.
 @pytest.mark.parametrize(
     ("over", "what"),
     [
-        ({}, "nothing to sweep over"),
         ({"fault:fog": [1.0]}, "fog"),
-        ({FRAMES: ["much"]}, "'much' is no dose; give numbers, in share"),
         ({FRAMES: [0.0]}, "no value to vary it over"),
         ({"window.lag": [1.0]}, "no setting window.lag"),
         ({"seeds": [3]}, "seeds: no run depends on it"),
-        ({FRAMES: [0.1], TURNED: [0.1], "window.lag_s": [1.0]}, "3 axes make no grid"),
     ],
 )
 def test_what_cannot_be_swept_is_told_in_a_line(short, over, what):
