@@ -73,7 +73,7 @@ _ALONG_AN_AXIS = 0.9
 _STEADY, _STILL = 0.95, 1e-9
 # A turn of a body that is told, and is no other axes: an extrinsic that is a little off.
 _LEAST_TOLD_RAD = float(np.deg2rad(2.0))
-_ROUNDED_RAD = 1e-6
+_ROUNDED = 1e-6
 _NAMES = "xyz"
 Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 
@@ -124,7 +124,7 @@ class Reference(NamedTuple):
 def of_the_camera(sequence: Sequence) -> Reading:
     R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T
     remedy = "the poses look like the left camera's: multiply each by the inverse of T_imu_cam from the right"
-    return Reading("read as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
+    return Reading("read as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu, is_of_a_body=True)
 
 
 _INVERTED = Reading("inverted", CONJUGATE, transposed)
@@ -283,12 +283,18 @@ class Turns(NamedTuple):
 
 
 def check_turns(
-    what: str, reference: Reference, t_ns: IntArray, R_world_body: Array, readings: Iterable[Reading]
+    what: str,
+    reference: Reference,
+    t_ns: IntArray,
+    R_world_body: Array,
+    readings: Iterable[Reading],
+    fitted_more: float = np.inf,
 ) -> Turns:
     """Hold rotations (N, 3, 3) against the gyro; neither is found where the recording is too short or straight.
 
     Raises DataError where they agree under one of the readings, and neither as given nor with other axes of the body:
-    misread rotations turn the other way and about other axes.
+    misread rotations turn the other way and about other axes. A reading may leave ``fitted_more`` times as much
+    unexplained as such a body, which is none where the rotations are known to be the reference's own.
     """
     within = stamps_among(t_ns, reference.rates_t_ns)
     steps, given = Steps.of(t_ns[within]), R_world_body[within]
@@ -304,7 +310,8 @@ def check_turns(
         return Turns(True, other)
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
-    if fit > max(_FITTING_CORRELATION, far_better, 1.0 - _FITTED_MORE * (1.0 - turned)):
+    beats_a_body = other is None or best.is_of_a_body or fit > 1.0 - fitted_more * (1.0 - turned + _ROUNDED)
+    if fit > max(_FITTING_CORRELATION, far_better) and beats_a_body:
         raise _only_if(what, reference, best)
     return Turns(as_given > max(_FITTING_CORRELATION, fit), other)
 
@@ -376,7 +383,7 @@ def _body(
             return given
         # A reading that leaves no turn is likelier than one that leaves a turn, which a loop may make by chance.
         best = min(left, key=lambda one: left[one].scatter_rad)
-        least_rad = given.scatter_rad * (_FITTED_MORE if fits else 1.0 / _TIMES) + _ROUNDED_RAD
+        least_rad = given.scatter_rad * (_FITTED_MORE if fits else 1.0 / _TIMES) + _ROUNDED
         if not (fits and left[best].is_other_body) and left[best].scatter_rad < min(most_rad, least_rad):
             raise _only_if(what, reference, best)
         if fits:
@@ -385,7 +392,7 @@ def _body(
         raise _only_if(what, reference, _EACH_INVERTED)
     some = slice(None, None, 1 + len(file) // _ENOUGH_TURNS)
     t_ns, R_world_body = t_ns[some], file.T_world_imu[some, :3, :3]
-    confirmed, turn = check_turns(what, reference, t_ns, R_world_body, others)
+    confirmed, turn = check_turns(what, reference, t_ns, R_world_body, others, _FITTED_MORE)
     if turn is None and matched is not None:
         turn = _turned_on_a_line(*matched)
     if not confirmed and turn is None:
