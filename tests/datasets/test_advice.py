@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -264,6 +265,14 @@ def save_npz(path: Path, arrays: dict[str, Any]) -> None:
     np.savez(path, **arrays)
 
 
+def save_twice(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an archive in which the first array stands twice."""
+    np.savez(path, **arrays)
+    with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        archive.writestr(archive.namelist()[0], archive.read(archive.namelist()[0]))
+
+
 def save_short(path: Path, arrays: dict[str, Any]) -> None:
     """Write an archive whose features end before their header says."""
     np.savez(path, **{key: array for key, array in arrays.items() if key != "features"})
@@ -514,6 +523,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (put(imu_T_cam=TILTED[1].T), "expected 0, 0, 0, 1; transpose it?"),
         (put(cam_T_imu=np.eye(4)), "delete the one that is wrong"),
+        (write(save_twice), "save it with one array of that name"),
         (check("--tracks", "images"), "its format has tracks and no images; leave --tracks images out"),
         (check("--topics", "imu=/imu0"), "a bag has; leave --topics out, or compare it by itself"),
         (say("tracks", "@", "--out", "x"), "a folder as EuRoC's or KITTI's", say("tracks", "@/../none", "--out", "x")),
@@ -648,7 +658,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say(*IMPORT, "n" * 201), "too long for a recording; shorten it", INTO),
         (kept(tracks=3), "give a dict of arrays", kept()),
         (kept(tracks=OWN["tracks"] | {"uL": OWN["tracks"]["uL"].astype("M8[ns]")}), "uL is 1970-01-01T00:00", kept()),
-        (kept(tracks=OWN["tracks"] | {"uL": OWN["tracks"]["uL"] * 1j}), "row 0: uL is ", kept()),
+        (kept(tracks=OWN["tracks"] | {"uL": OWN["tracks"]["uL"] * 1j}), "give their real parts", kept()),
         (
             call(lambda at: load_sequence(str(at)).truncated(-1)),
             "give the number of those to keep",

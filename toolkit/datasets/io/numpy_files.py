@@ -14,6 +14,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -172,7 +173,11 @@ def opened(path: Path) -> Iterator[NpzArchive]:
     """Open an archive; damage met while it is open is raised as DataError."""
     try:
         with open_input(path) as file, zipfile.ZipFile(file) as archive:
-            yield NpzArchive(path, archive)
+            found = NpzArchive(path, archive)
+            twice = [key for key, times in Counter(found.keys).items() if times > 1]
+            if twice:
+                raise DataError(f"{path}: {twice[0]} is in the archive twice; save it with one array of that name")
+            yield found
     except (OSError, *_DAMAGED_ZIP) as error:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
 

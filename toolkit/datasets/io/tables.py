@@ -164,6 +164,8 @@ class Columns:
         values = self.given[name]
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
+        if values.dtype.kind == "c":
+            raise DataError(f"{self.what}: column {name} holds complex numbers; give their real parts")
         # NumPy gives dates of nanoseconds as whole numbers, which are no column's.
         cells: list[Any] = list(map(str, values)) if values.dtype.kind in "mM" else values.tolist()
         return cells
