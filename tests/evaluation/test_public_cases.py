@@ -271,17 +271,19 @@ def headed(heading: str, of: Lines = lambda lines: lines[1:]) -> Lines:
 
 SOUND: list[str] = []  # the lines before they were spoilt
 CONJUGATED = posed(lambda poses: se3(np.swapaxes(poses[:, :3, :3], 1, 2), poses[:, :3, 3]))
-INVERTED = posed(np.linalg.inv)
+INVERTED, BACKWARDS = posed(np.linalg.inv), posed(lambda poses: poses[::-1])
 EXCHANGED = placed(lambda positions: positions[:, [1, 0, 2]])
 STATE = "{t} {qw:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {x:.9f} {y:.9f} {z:.9f} 0 0 0 0 0 0 0 0 0"
 # What spoils the lines of a sound file, then each advice with what somebody does who follows it.
 ADVICE: list[tuple[Lines | str, ...]] = [
     (lambda lines: lines[:120] + lines[110:],
      "sort the file by time", lambda lines: sorted(lines, key=lambda line: float(line.split()[0])),
-     "(and 9 more do); keep one of the two", lambda lines: list(dict.fromkeys(lines))),
+     "(and 9 more do); remove what is there twice", lambda lines: list(dict.fromkeys(lines))),
     (lambda lines: [*lines[:50], lines[49].split()[0] + " " + lines[50].partition(" ")[2], *lines[50:]],
      "keep one of the two", without_line(50)),
     (instead(50, " nan" * 7), "line 51 holds a value that is not finite; remove the line", without_line(50)),
+    (lambda lines: [f"{i} {line}" for i, line in enumerate(lines)],
+     "the first column is the number of the row, and stamps come first; remove it", ordered(" ", *range(1, 9))),
     (stamped(lambda t: t / 1000), "multiply the stamps by 1000", stamped(lambda t: t * 1000)),
     (stamped(lambda t: t + 7200),
      "the clocks are about -2 h apart, as time zones are: shift it", stamped(lambda t: t - 7200)),
@@ -301,6 +303,7 @@ ADVICE: list[tuple[Lines | str, ...]] = [
      "check the order of the columns", ordered(" ", 0, 5, 6, 7, 1, 2, 3, 4)),
     (CONJUGATED, "conjugate them", CONJUGATED),
     (INVERTED, "the poses look like those of the world in the IMU frame: invert each one", INVERTED),
+    (BACKWARDS, "write them in the order of their stamps", BACKWARDS),
     (placed(lambda p: 1e3 * p), "divide its positions by 1000", placed(lambda p: 1e-3 * p)),
     (EXCHANGED, "write both in the same", EXCHANGED),
     (replaced({" ": ","}), "a TUM file has blanks between its columns", replaced({",": " "})),

@@ -1,8 +1,8 @@
 """Whether a trajectory belongs to a recording, or to a truth: the same clock, unit of length, rotations and axes.
 
 Each check asks for rival readings of the file, and accuses it only where one of them fits far better than the file as
-it is given: another unit of time, of length, another order of quaternions, inverse poses, another body, exchanged axes.
-A file that fits under none is an estimate that went wrong, and is scored as it is.
+it is given: another unit of time, of length, another order of quaternions, inverse poses, poses that run backwards,
+another body, exchanged axes. A file that fits under none is an estimate that went wrong, and is scored as it is.
 
 Axes are exchanged, or have the wrong sign, where columns of a file are exchanged or its world is left-handed. Positions
 that fit the truth's far better after a reflection are mirrored; those that fit, with orientations that are off by one
@@ -129,6 +129,13 @@ def of_the_camera(sequence: Sequence) -> Reading:
 
 _INVERTED = Reading("inverted", CONJUGATE, transposed)
 _EACH_INVERTED = Reading("each pose is inverted", INVERT_EACH, transposed)
+# Poses in the reverse of their order, on stamps that go on.
+_BACKWARDS = Reading(
+    "read backwards",
+    "its poses run backwards: write them in the order of their stamps",
+    lambda rotations: rotations[::-1],
+    -1,
+)
 
 
 def body_of(
@@ -374,7 +381,7 @@ def _body(
     That is at best one turn of the body, however large. Where positions do not tell, the rates of rotation do.
     """
     what = str(file.path)
-    others = (*filter(None, (file.other_order,)), _INVERTED, *readings)
+    others = (*filter(None, (file.other_order,)), _INVERTED, _BACKWARDS, *readings)
     if fit is not None and fit.turns:
         given, left = fit.body, {one: fit.reread(one).body for one in others}
         most_rad = min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
@@ -585,7 +592,8 @@ class _Fit:
 
     def reread(self, reading: Reading) -> "_Fit":
         """Return the fit of the poses read otherwise."""
-        return _Fit(self.truth, se3(reading.reread(self.estimate[:, :3, :3]), self.estimate[:, :3, 3]))
+        rotations, positions = self.estimate[:, :3, :3], self.estimate[:, :3, 3]
+        return _Fit(self.truth, se3(reading.reread(rotations), positions[:: reading.step]))
 
     def off_share(self, matrix: Array) -> float:
         """Return how far positions whose axes are exchanged are off the truth's at best, of the truth's extent."""

@@ -157,11 +157,15 @@ def _between(line: str, separator: str) -> list[str]:
 
 
 class Reading(NamedTuple):
-    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it."""
+    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it.
+
+    ``step`` is that through the positions (N, 3) then.
+    """
 
     only_if: str
     remedy: str
     reread: Callable[[Array], Array]
+    step: int = 1
 
 
 def _w_first(remedy: str, roll: int = -1) -> Reading:
@@ -463,6 +467,8 @@ def read_finite_poses(path: Path, cov_convention: CovConvention | None = None) -
             return _by_name(rows, named)
         if rows.width == len(POSITIONS_ALONE.split()):
             return _by_name(rows, Named(0, None, (1, 2, 3), ()))
+        if _begins_with_row_numbers(rows):
+            raise DataError(f"{path}: the first column is the number of the row, and stamps come first; remove it")
         for one in (_OPENVINS_RECORDED, TUM_COV, *(_SAYS_SO if said else ()), *FORMATS.values()):
             if one.recognises(rows):
                 return one.parse(rows).with_convention(cov_convention)
@@ -517,6 +523,17 @@ def _unit_ns(stamps: Array) -> int:
     return 1 if (probable_unit(stamps) or "").startswith("nanoseconds") else NS_PER_S
 
 
+def _begins_with_row_numbers(rows: Rows) -> bool:
+    """Say whether the first column counts the rows, and the second increases as stamps do."""
+    if rows.cells[0][0].partition(".")[0] not in ("0", "1"):
+        return False
+    try:
+        first, second = np.array([[float(cell) for cell in cells[:2]] for cells in rows.cells]).T
+    except ValueError:
+        return False
+    return bool(len(first) > 1 and first[0] in (0.0, 1.0) and (np.diff(first) == 1.0).all() and second.min() > 1e8)
+
+
 def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> PosesFile:
     kept = known_poses(values)
     numbers = [n for n, is_kept in zip(rows.line_numbers, kept.tolist(), strict=True) if is_kept]
@@ -562,7 +579,7 @@ def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: A
     checks = (
         (np.isfinite(values).all(axis=1), f"holds a value that is not finite; remove the {row}"),
         (np.abs(values[:, :3]).max(axis=1, initial=0.0) < FARTHEST_M, _TOO_FAR),
-        *_increasing(t_ns),
+        *_increasing(t_ns, values),
         (
             np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < _UNIT_TOLERANCE,
             "has a quaternion that is not of unit length; check the order of the columns",
@@ -572,12 +589,14 @@ def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: A
     return se3(rotation_from_quaternion(values[:, 3:]), values[:, :3])
 
 
-def _increasing(t_ns: IntArray) -> Iterator[tuple[BoolArray, str]]:
-    """Yield the checks of time: stamps that fall, and poses of one stamp."""
+def _increasing(t_ns: IntArray, values: Array) -> Iterator[tuple[BoolArray, str]]:
+    """Yield the checks of time: stamps that fall, poses that are there twice, and poses of one stamp."""
     step_ns = np.diff(t_ns, prepend=t_ns[:1] - 1)
+    again = np.append(False, (values[1:] == values[:-1]).all(axis=1)) & (step_ns == 0)
     yield step_ns >= 0, "is earlier than the one before it; sort the file by time"
-    more = f" (and {(step_ns == 0).sum() - 1} more do)" if (step_ns == 0).sum() > 1 else ""
-    yield step_ns != 0, f"has the stamp of the one before it{more}; keep one of the two"
+    repeated = f" (and {int(again.sum()) - 1} more do)" if again.sum() > 1 else ""
+    yield ~again, f"repeats the one before it{repeated}; remove what is there twice"
+    yield step_ns != 0, "has the stamp of the one before it, and another pose; keep one of the two"
 
 
 def _check_digits(rows: Rows, table: Array, stamp: int = 0) -> None:
