@@ -24,7 +24,7 @@ from toolkit.geometry import (
 )
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Sequence, Truth
-from toolkit.simulation import FLIGHT, simulate
+from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 COUNT, STEP_S, START_S = 200, 0.1, 1.4e9
 FORWARD_MPS, LEFT_TURN_RADPS = 10.0, 0.3
@@ -112,6 +112,18 @@ def test_the_gyro_gives_w_first_away_where_the_path_cannot(seed: int) -> None:
     misread = rotation_from_quaternion(np.roll(quaternion_from_rotation(R_world_imu), 1, axis=1))
     with pytest.raises(DataError, match="w first"):
         with_truth(sequence, replace(truth, T_world_imu=se3(misread, positions)))
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_two_seconds_of_a_drive_give_w_first_away(every: int) -> None:
+    """Its body turned as a whole would fit as well, of few steps about one axis, but the truth is the recording's."""
+    drive = simulate(replace(DRIVE, duration_s=2.0), 0)
+    assert drive.truth is not None
+    t_ns, poses = drive.truth.t_ns[::every], drive.truth.T_world_imu[::every]
+    misread = rotation_from_quaternion(np.roll(quaternion_from_rotation(poses[:, :3, :3]), 1, axis=1))
+    with_truth(drive, Truth(t_ns, poses))
+    with pytest.raises(DataError, match="w first"):
+        with_truth(drive, Truth(t_ns, se3(misread, poses[:, :3, 3])))
 
 
 def test_a_gyro_of_noise_alone_or_with_gaps_and_reversed_stamps_refuses_no_truth() -> None:

@@ -139,10 +139,6 @@ def most_information_gained(scenario, belief, correct) -> float:
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
 def test_at_latest_estimates_none_is_gained_in_invariant_errors_but_in_plain_ones(scenario) -> None:
     """Of the whole joint belief, landmarks included; after marginalising them less is left."""
-
-    def anchored(rig):
-        return partial(AnchoredBelief, T_imu_cam=rig.T_imu_cam)
-
     for correct in (correct_by_landmarks, iekf.correct):
         # The condition of a joint covariance is some 1e9: seven digits of the information are left.
         gained = most_information_gained(

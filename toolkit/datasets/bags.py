@@ -100,7 +100,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
         motion=motion,
         provenance=Provenance("bags", f"{path}: stereo tracks from the images", (*seen.facts, *facts)),
     )
-    return sequence if truth is None else with_truth(sequence, truth_near(truth, seen.frames_t_ns))
+    return sequence if truth is None else with_truth(sequence, *truth_near(truth, seen.frames_t_ns))
 
 
 def _read(

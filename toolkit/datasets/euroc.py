@@ -22,7 +22,14 @@ from toolkit.datasets.io.euroc_calibration import PIXEL_SIGMA_PX, AslCalibration
 from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import Listed, check_both_cameras, image_folder, images_in, pairs_of_asl, seen_in
 from toolkit.datasets.io.tables import columns_of_file, headings_of, imu_columns, read_stamps
-from toolkit.datasets.io.truth import find_truth, seconds_apart, stamps_within, truth_at, truth_near
+from toolkit.datasets.io.truth import (
+    LONGEST_TRUTH_GAP_S,
+    find_truth,
+    seconds_apart,
+    stamps_within,
+    truth_at,
+    truth_near,
+)
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified
@@ -115,10 +122,12 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     filmed, remarks = _filmed(layout, mav0, imu, calibration)
     seen = seen_in(layout.root, filmed, calibration.T_imu_left, frontend, progress)
     choice = find_truth(layout.root, mav0, imu)
+    truth, of_truth = (None, ()) if choice is None else truth_near(choice.truth, seen.frames_t_ns)
     facts = (
         *seen.facts,
         *remarks,
         *(() if choice is None else choice.facts),
+        *of_truth,
         *(calibration.source, calibration.noise_source, *calibration.shifted, *calibration.unused),
     )
     simulated = is_simulated(layout.root)
@@ -130,7 +139,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         observations=seen.observations,
         motion=imu,
         provenance=Provenance("euroc", f"{path}: {RENDERED if simulated else REAL}", facts),
-        truth=None if choice is None else truth_near(choice.truth, seen.frames_t_ns),
+        truth=truth,
     )
     return with_scene_errors(sequence) if simulated else sequence
 
@@ -151,9 +160,8 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         raise DataError(": ".join((f"{layout.root}: no ground truth in {where}, {why}", *few_images)))
     stamps = read_stamps(layout.stamps)
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
-    apart_s = seconds_apart(choice.truth)
-    if apart_s and frames_t_ns.size < 2:
-        slow = f"the truth has a pose every {apart_s:.3g} s"
+    if frames_t_ns.size < 2 and seconds_apart(choice.truth) > LONGEST_TRUTH_GAP_S:
+        slow = f"the truth has a pose every {seconds_apart(choice.truth):.3g} s"
         why = "where there are no images the tracks are simulated along it"
         raise DataError(f"{layout.root}: {slow}, and {why}; give a truth of 10 Hz or more")
     check_frame_count(layout.root, frames_t_ns.size)

@@ -34,7 +34,7 @@ from toolkit.sequence import Sequence, Truth
 OF_POSITIONS = "the truth is of positions alone: its orientations are all one"
 _KIND = "a truth file is TUM text, one pose a line"
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
-_LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
+LONGEST_TRUTH_GAP_S = 0.1
 # Rotations are compared over steps of such lengths: shorter ones are noise, and some truths have gaps of minutes.
 _SHORTEST_STEP_NS, _LONGEST_STEP_S = NS_PER_S // 10, 0.5
 # Rates of two unrelated motions differ by at least the gyro's rates; those of a noisy motion capture by half of that.
@@ -107,18 +107,23 @@ def stamps_within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) ->
     first, last = max(imu_t_ns.min(), truth_t_ns[0]), min(imu_t_ns.max(), truth_t_ns[-1])
     inside = stamps[(stamps >= first) & (stamps <= last)]
     after = np.clip(np.searchsorted(truth_t_ns, inside), 1, truth_t_ns.size - 1)
-    return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= _LONGEST_TRUTH_GAP_NS])
+    return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= LONGEST_TRUTH_GAP_S * NS_PER_S])
 
 
 def seconds_apart(truth: Truth) -> float:
-    """Return the median step of a truth where its poses are too far apart to be interpolated, or else 0."""
-    step_ns = float(np.median(np.diff(truth.t_ns))) if truth.t_ns.size > 1 else 0.0
-    return step_ns / NS_PER_S if step_ns > _LONGEST_TRUTH_GAP_NS else 0.0
+    """Return the median step between the poses of a truth."""
+    return float(np.median(np.diff(truth.t_ns))) / NS_PER_S if truth.t_ns.size > 1 else 0.0
 
 
-def truth_near(truth: Truth, t_ns: IntArray) -> Truth:
-    """Return the truth at those of the stamps (K,) that it reaches; at its own where its poses are too far apart."""
-    return truth if seconds_apart(truth) else truth_at(truth, stamps_within(t_ns, truth.t_ns, truth.t_ns))
+def truth_near(truth: Truth, t_ns: IntArray) -> tuple[Truth, tuple[str, ...]]:
+    """Return the truth at those of the stamps (K,) that it reaches, and what to know of it.
+
+    Where its poses are too far apart to be interpolated it keeps its own stamps, and runs are scored there.
+    """
+    reached = stamps_within(t_ns, truth.t_ns, truth.t_ns)
+    if reached.size > 1:
+        return truth_at(truth, reached), ()
+    return truth, (f"the truth has a pose every {seconds_apart(truth):.3g} s: runs are scored at its stamps",)
 
 
 def truth_at(truth: Truth, t_ns: IntArray) -> Truth:

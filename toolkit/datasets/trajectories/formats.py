@@ -159,13 +159,14 @@ def _between(line: str, separator: str) -> list[str]:
 class Reading(NamedTuple):
     """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it.
 
-    ``step`` is that through the positions (N, 3) then.
+    ``step`` is that through the positions (N, 3) then; it may be one of another body that is known, as the camera.
     """
 
     only_if: str
     remedy: str
     reread: Callable[[Array], Array]
     step: int = 1
+    is_of_a_body: bool = False
 
 
 def _w_first(remedy: str, roll: int = -1) -> Reading:
