@@ -835,7 +835,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (lines(TABLES[1], restamped(lambda t: t + 20_000_000)), "clocks differ, correct the stamps of cam1"),
         (
             both(gone(YAMLS[1]), text("orb.yaml", "Camera1.fx: 50.0")),
-            "orb.yaml is not read; write the calibration as docs/images.md describes",
+            "orb.yaml of ORB-SLAM3 is not read; write the calibration as docs/images.md describes",
             chain(),
         ),
         (chain(second="cam2"), "calibrate cam0 and cam1 together", chain()),

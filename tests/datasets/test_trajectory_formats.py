@@ -139,7 +139,7 @@ CELLS = [
 TIME = dict.fromkeys(("tum", "euroc", "openvins"), 0)
 QUATERNION = {"tum": 4, "euroc": 4, "openvins": 1}
 OF_STAMPS = [
-    (2, TIME, "the same", "line 3 has the stamp of the one before it; keep one of the two"),
+    (2, TIME, "the same", "line 3 has the stamp of the one before it, and another pose; keep one of the two"),
     (2, QUATERNION, "3.0", "line 3 has a quaternion that is not of unit length"),
 ]
 

@@ -353,6 +353,12 @@ def test_what_kalibrs_bag_extractor_writes_is_a_recording(asl: Path) -> None:
     assert (load_sequence(str(asl / "extracted")).motion.values == motion.values).all()
 
 
+def test_a_recording_without_its_imu_is_told_what_to_do(asl: Path) -> None:
+    (asl / "mav0/imu0/data.csv").unlink()
+    with pytest.raises(DataError, match=r"no imu0\.csv of Kalibr's: name the folder that has mav0, or rectify"):
+        load_sequence(str(asl))
+
+
 def test_recordings_are_named_some_levels_below(asl: Path, tmp_path: Path) -> None:
     above = tmp_path / "downloads"
     (above / "dataset/sequences").mkdir(parents=True)

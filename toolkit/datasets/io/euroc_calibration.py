@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from toolkit.datasets.io.fields import Fields, read_fields, rigid
 from toolkit.errors import DataError, printable
-from toolkit.files.reading import is_regular
+from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend.cameras import Camera, Distortion, Pinhole, check_beside
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import ImuNoise, StereoRig
@@ -66,8 +66,14 @@ _USED = {
     *("distortion_coeffs", "intrinsics", "resolution", _SHIFT, *_DENSITIES.values()),
 }
 _OF_NO_EFFECT = {"rostopic", "cam_overlaps", "comment", "sensor_type", "rate_hz", "update_rate", "model"}
-# Files that are named where none of them is read.
-_NAMED, _KINDS = 3, ("*.yaml", "*.yml", "*.json")
+# Whose calibration a file is that is not read, by names in it, and how much of it is looked at; files that are named.
+_SYSTEMS = {
+    "Basalt": (b'"T_imu_cam"', b'"value0"'),
+    "VINS": (b"body_T_cam0", b"cam0_calib"),
+    "ORB-SLAM3": (b"Camera1.fx", b"Camera.fx", b"ORBextractor"),
+    "OpenVINS": (b"relative_config_imucam",),
+}
+_LOOKED_AT, _NAMED, _KINDS = 1 << 16, 3, ("*.yaml", "*.yml", "*.json")
 _COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs")
 
 
@@ -140,11 +146,17 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
 def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
     missing = ", ".join(str(file.relative_to(mav0)) for file in lacking)
     there = [file for folder in (mav0.parent, mav0) for kind in _KINDS for file in folder.glob(kind)]
-    others = [f"{printable(file.name)} is not read" for file in sorted(set(there))[:_NAMED]]
+    others = [f"{printable(file.name)}{_of_system(file)} is not read" for file in sorted(set(there))[:_NAMED]]
     return (
         f"{mav0}: missing {missing}, and there is no *camchain*.yaml of Kalibr's that states it{'; ' if others else ''}"
         f"{', '.join(others)}; write the calibration as docs/images.md describes"
     )
+
+
+def _of_system(file: Path) -> str:
+    with open_input(file) as opened:
+        content = opened.read(_LOOKED_AT)
+    return next((f" of {system}" for system, names in _SYSTEMS.items() if any(n in content for n in names)), "")
 
 
 def _unused(sensor: Fields, name: str = "") -> Iterator[str]:
