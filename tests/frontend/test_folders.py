@@ -157,7 +157,6 @@ def test_bad_images_are_named_and_left_out(
 
 USED: list[Callable[[Path], object]] = [
     lambda d: [every(d, c, lambda i: cv2.merge([i, i, i])) for c in (0, 1)],
-    lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)],
     lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256),
     lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)],
     lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)],
