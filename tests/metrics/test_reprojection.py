@@ -60,7 +60,7 @@ def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap():
     run = make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, Landmarks(landmarks.track_ids, points))
     errors_px = reprojection.in_sample_errors(Evaluation(run, "final", sequence))
     lost = np.isin(sequence.visible.track_id, landmarks.track_ids[:2])
-    assert (errors_px[lost] == CAP_PX).all()
+    assert (errors_px[lost] == 100.0).all()
     assert errors_px[~lost].max() < 1e-9  # exact points, rounding only
     assert f"{lost.sum()} behind the camera" in score_run(run, "final", sequence).notes["reproj_rmse_px"]
 

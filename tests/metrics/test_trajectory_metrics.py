@@ -159,6 +159,14 @@ def test_a_path_that_is_shorter_than_100_m_or_a_step_that_is_a_tenth_longer_has_
             assert "100 m" in scores.notes[key]
 
 
+@pytest.mark.parametrize(("resumed_at", "scored"), [(20, True), (21, False)])
+def test_a_second_that_ends_in_a_gap_lasts_half_a_step_longer_at_most(resumed_at, scored):
+    """From the last frame before the gap, at 0.9 s, the first one a second on is 1.1 or 1.2 s later."""
+    sequence, kept = make_sequence(drive_poses(30), track_count=3), np.r_[0:10, resumed_at : resumed_at + 9]
+    run = make_run(sequence.frames_t_ns[kept], sequence.truth.T_world_imu[kept])
+    assert (score_run(run, "final", sequence).values["rpe_1s_m"] is not None) == scored
+
+
 def test_end_drift_is_the_last_error_over_the_path(score):
     poses = se3(np.eye(3), np.outer(np.arange(51.0), [2.0, 0.0, 0.0]))
     sequence = make_sequence(poses, track_count=3)
