@@ -456,8 +456,9 @@ _TROUBLE = "it goes on through every planted fault"
 _NO_COVARIANCE = "it states no covariance"
 # What to do where a promise is broken.
 _REMEDIES: Mapping[str, str] = {name: remedy for name, (_, remedy) in OF_A_RUN.items()} | {
-    _RUNS: "see the line named; raise EstimatorError, with the reason, where it cannot go on, and in build() for an "
-    "input that it is not made for (setup.motion_kind)",
+    _RUNS: "see what is named: answer with packet.frame.t_ns and arrays of the shapes in docs/extending.md; raise "
+    "EstimatorError, with the reason, where it cannot go on, and in build() for an input that it is not made for "
+    "(setup.motion_kind)",
     _COVARIANCE: "symmetrise after every update, P = (P + P^T) / 2; look for a subtraction that may leave less than "
     "nothing; the pose comes first, rotation before position, in the body frame",
     _NEES: "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "

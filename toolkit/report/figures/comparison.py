@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from msgspec.structs import asdict
 
@@ -114,8 +115,9 @@ def _map(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title:
         entries.append(Entry.of_line(_name(run), stroke["color"], stroke["linestyle"], 1.8))
     if mapper is not None and len(mapper.landmarks):
         x, y = landmarks.T
-        dots = axes.scatter(x, y, s=3.0, color=style.LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1)
-        entries.append(Entry(f"landmarks of {mapper.estimator}", dots))
+        axes.scatter(x, y, s=3.0, color=style.LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1)
+        dot = Line2D([], [], color=style.LANDMARK_COLOUR, marker="o", markersize=4.0, linestyle="")
+        entries.append(Entry(f"landmarks of {mapper.estimator}", dot))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="box")
     style.label_axes(axes, title, "x [m]", "y [m]")

@@ -123,23 +123,22 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     axes = figure.subplots()
     style.label_axes(axes, "", "CPU of a frame [ms]", f"{metric.name} [{metric.unit}]")
     reached = {name: _reached(sweep, axis, name) for name in sweep.estimators}
-    everywhere = [at for points in reached.values() for at in points.values()]
+    everywhere = [(one.cpu_ms, one.error) for spots in reached.values() for one in spots]
     words: list[tuple[str, tuple[float, float]]] = []
-    for name, points in reached.items():
+    for name, spots in reached.items():
         stroke = style.stroke_of(reached, name)
-        line = [at for point, at in points.items() if point]
+        line = [(one.cpu_ms, one.error) for one in spots if one.values]
         axes.plot(*np.reshape(line, (-1, 2)).T, linewidth=1.0, alpha=0.6, **stroke)
-        for point, at in points.items():
+        for one in spots:
+            at = one.cpu_ms, one.error
             on_front = not any(other != at and other[0] <= at[0] and other[1] <= at[1] for other in everywhere)
             face = stroke["color"] if on_front else "white"
             axes.plot(*at, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face, **stroke)
-            values = [shown_value(point[0][1])] if point and len(points) > 1 else []
-            words.append(
-                (" = ".join([*values, *([_word(axis)] if at[1] == sweep.effects[name, CLEAN].error else [])]), at)
-            )
+            values = one.values if len(spots) > 1 else ()
+            words.append((" = ".join([*values, *([_word(axis)] if one.is_clean else [])]), at))
     cpu_ms, errors = np.reshape(everywhere, (-1, 2)).T
     if cpu_ms.size:
-        style.scale_by_decades(axes, 0.8 * cpu_ms.min(), 1.25 * cpu_ms.max(), "x")
+        style.scale_by_decades(axes, 0.8 * cpu_ms.min(), 1.6 * cpu_ms.max(), "x")
         style.scale_by_decades(axes, 0.8 * errors.min(), 1.25 * errors.max())
     title = f"{sweep.grid.case.name}: error against time over {axis.name}"
     style.add_title(figure, title)
@@ -148,7 +147,8 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     _label(axes, words)
     caption = (
         f"{metric.name} against processor time over the values of {axis.name} on {sweep.grid.case.name}, means over "
-        "the runs. Filled: on the Pareto front, no other is both more accurate and faster."
+        "the runs; values of one error are one point, at the fastest. Filled: on the Pareto front, no other is both "
+        "more accurate and faster."
     )
     return NamedFigure(f"pareto_{plain_name(axis.name)}", caption, figure)
 
@@ -168,16 +168,26 @@ def _label(axes: Axes, words: list[tuple[str, tuple[float, float]]]) -> None:
             text.remove()
 
 
-def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, float]]:
-    """Return CPU (ms) and error at each point where all runs are ok, of those of one error only one."""
-    effects = {point: sweep.effects[name, point] for point in (*axis.points, CLEAN)}
-    good = {
-        point: (one.cpu_ms, one.error)
-        for point, one in effects.items()
-        if one.ok == one.runs and one.error and one.cpu_ms
-    }
-    errors = [error for _, error in good.values()]
-    return {point: at for i, (point, at) in enumerate(good.items()) if at[1] not in errors[:i]}
+class _Spot(NamedTuple):
+    """Where values of an axis lead to that have one error: the CPU (ms) of the fastest of them, and the error."""
+
+    cpu_ms: float
+    error: float
+    values: tuple[str, ...]
+    is_clean: bool
+
+
+def _reached(sweep: Sweep, axis: Axis, name: str) -> list[_Spot]:
+    """Return what an estimator reaches where all its runs are ok, in the order of the axis and the clean one last."""
+    by_error: dict[float, list[tuple[float, Point]]] = {}
+    for point in (*axis.points, CLEAN):
+        one = sweep.effects[name, point]
+        if one.ok == one.runs and one.error and one.cpu_ms:
+            by_error.setdefault(one.error, []).append((one.cpu_ms, point))
+    return [
+        _Spot(min(alike)[0], error, tuple(shown_value(p[0][1]) for _, p in alike if p), any(not p for _, p in alike))
+        for error, alike in by_error.items()
+    ]
 
 
 class _Bar(NamedTuple):
