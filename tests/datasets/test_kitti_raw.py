@@ -26,13 +26,13 @@ def stamp(seconds: float) -> str:
     return f"2011-09-26 13:02:{25.0 + seconds:012.9f}\n"
 
 
-def packet(t_s: float, yaw: float = 0.0) -> str:
+def packet(t_s: float, yaw: float = 0.0, turning_radps: float = 0.0) -> str:
     """Return a packet of a drive to the east at constant speed; a metre is so many degrees on the equator."""
     east_deg = np.rad2deg(SPEED_MPS * t_s / 6378137.0)
     values = np.zeros(30)
     values[[1, 2, 5]] = east_deg, 110.0, yaw
     values[[7, 8]] = SPEED_MPS
-    values[13] = 9.81
+    values[13], values[19] = 9.81, turning_radps
     return numbers(values)
 
 
@@ -75,7 +75,7 @@ def test_slow_packets_are_twists_and_fast_ones_an_imu(drive: Path) -> None:
     write_packets(drive, 100.0)
     fast = load_sequence(str(drive))
     assert isinstance(fast.motion, ImuSamples)
-    np.testing.assert_allclose(fast.motion.accel_mps2[0], [0.0, 0.0, 9.81])
+    np.testing.assert_allclose(fast.motion.values[0], [0.0, 0.0, 9.81, 0.0, 0.0, 0.0])
     shutil.rmtree(drive / "oxts")
     assert load_sequence(str(drive)).motion_kind == "none"
 
@@ -85,11 +85,12 @@ def test_the_truth_is_east_north_up_and_of_the_same_instrument(drive: Path) -> N
     assert not truth.independent
     np.testing.assert_allclose(truth.T_world_imu[:, :3, 3], np.outer(0.05 * np.arange(9), [1.0, 0.0, 0.0]), atol=1e-6)
     # a car that heads north has its x along the world's y
-    (drive / "oxts/data/0000000000.txt").write_text(packet(0.0, yaw=np.pi / 2.0))
+    (drive / "oxts/data/0000000000.txt").write_text(packet(0.0, yaw=np.pi / 2.0, turning_radps=0.2))
     turned = load_sequence(str(drive))
     np.testing.assert_allclose(turned.truth.T_world_imu[0, :3, 0], [0.0, 1.0, 0.0], atol=1e-9)
     assert isinstance(turned.motion, TwistSamples)
     np.testing.assert_allclose(turned.motion.v_mps[0], [0.0, -SPEED_MPS, 0.0], atol=1e-9)
+    np.testing.assert_allclose(turned.motion.w_radps[0], [0.0, 0.0, 0.2])
 
 
 def test_the_camera_is_where_the_three_files_put_it(drive: Path) -> None:
