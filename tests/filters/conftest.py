@@ -15,9 +15,9 @@ from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, IntArray, skew
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, skew
 from toolkit.measurements import Prior
-from toolkit.models.factors import L, StereoFactors
+from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
 from toolkit.models.state import IMU_LAYOUT, Belief
@@ -48,9 +48,12 @@ class Recording:
 
     def error_of(self, estimate: Estimate, k: int) -> Array:
         """Return the error (d,) of an estimate of state k, in the order of its covariance."""
-        model = motion_model(self.sequence.noise, self.sequence.gravity_world)
-        first = model.initial_belief(self.sequence.prior)
-        return first.at(self.truth_at(k)).error_to(first.at(estimate))
+        truth = self.truth_at(k)
+        pose = se3_log(se3_inverse(truth.T_world_imu) @ estimate.T_world_imu)
+        bias = estimate.bias - truth.bias
+        if self.sequence.motion_kind == "twist":
+            return np.concatenate([pose, bias[3:]])
+        return np.concatenate([pose, truth.T_world_imu[:3, :3].T @ (estimate.v_world - truth.v_world), bias])
 
 
 @cache
@@ -88,7 +91,7 @@ class BatchAtTruth:
 
     def _motion(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         recording, values = self._recording, gtsam.Values()
-        maker = self._model = motion_model(recording.setup.noise, recording.setup.gravity_world)
+        maker = motion_model(recording.setup.noise, recording.setup.gravity_world)
         graph = maker.hold(maker.initial_belief(recording.setup.prior), 0)
         for packet in recording.sequence.packets():
             maker.insert(values, recording.truth_at(packet.index), packet.index)
@@ -99,12 +102,14 @@ class BatchAtTruth:
 
     def state(self, k: int) -> tuple[Array, Array]:
         """Return the error (d,) of state k and its covariance (d, d), in the filters' order and frames."""
-        model, truth = self._model, self._recording.truth_at(k)
-        keys, turned = model.keys(k), np.eye(model.layout.size)
-        if model.layout.velocity is not None:
-            turned[model.layout.velocity, model.layout.velocity] = truth.T_world_imu[:3, :3].T
-        error = turned @ np.concatenate([self._delta.at(key) for key in keys])
-        return error, model.state_cov(self._marginals, k, truth.T_world_imu[:3, :3])
+        keys = [X(k), B(k)] if self._recording.sequence.motion_kind == "twist" else [X(k), V(k), B(k)]
+        joint = self._marginals.jointMarginalCovariance(keys)
+        error = np.concatenate([self._delta.at(key) for key in keys])
+        cov = np.block([[joint.at(one, other) for other in keys] for one in keys])
+        to_body = np.eye(len(error))
+        if len(keys) == 3:
+            to_body[6:9, 6:9] = self._recording.truth_at(k).T_world_imu[:3, :3].T
+        return to_body @ error, to_body @ cov @ to_body.T
 
 
 def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
