@@ -219,6 +219,7 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"truth": 3}, "truth: expected string or null, got integer"),
         ({"truth": "gt.tum", "seeds": 2}, "truth and seeds exclude each other"),
         ({"trajectories": "est.tum"}, "trajectories: expected object, got string"),
+        ({"own": {"ekf": print}}, "own has a function called ekf, and so has estimators"),
         ({"estimators": [3]}, r"estimators\[0\]: expected string, got integer"),
         ({"settings": {"window.lag_s": 3.0}}, r"write \{'window': \{'lag_s': ...\}\}, or in TOML window.lag_s without"),
         ({"settings": {"window": {"lag_s": np.array([1.0, 2.0])}}}, "window.lag_s is a ndarray; give a number"),

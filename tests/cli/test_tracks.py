@@ -63,3 +63,5 @@ def test_images_alone_are_compared_and_labelled(folder, vislam, capsys):
     assert "no motion measured (smooth motion assumed)" in table
     assert "no motion input" in Path("run/report.md").read_text()
     assert vislam("compare", "--config", "run/manifest.json", "--out", "again") == 0
+    assert vislam("compare", str(folder), "--tracks", "simulated") == 3
+    assert "EuRoC folders only" in capsys.readouterr().err

@@ -40,6 +40,7 @@ WRONG: list[tuple[str, int, str]] = [
     ("compare drive --set window.lag_s", 2, "--set takes KEY=VALUE"),
     ("compare drive --set estimators.ekff.gain=1", 5, "did you mean ekf?"),
     ("compare drive --estimators ekf --set estimators.ekf.gain=2", 5, "estimator ekf has no option gain"),
+    ("compare drive --config wrong.toml", 2, "wrong.toml: there is no setting outliers.gate; did you mean"),
     ("compare drive --config sound.toml --set window.lag=3", 2, "sound.toml or the command line: there is no setting"),
     ("compare drive --config asked.toml", 2, "asked.toml: there is no compare.estimator; did you mean estimators?"),
     ("compare drive --config typed.toml", 2, "typed.toml: compare.max_frames: expected integer >= 2"),
@@ -120,6 +121,7 @@ def files(vislam: Vislam) -> None:
     Path("kept.toml").write_text('[compare]\nkeep = ["stale"]\n')
     Path("broken.toml").write_text("window = [")
     Path("sound.toml").write_text("seeds = 1")
+    Path("wrong.toml").write_text("outliers.gate = 1")
     Path("gt.tum").write_text("0 0 0 0 0 0 0 1\n")
     for name in ("taken", "empty"):
         Path(name).touch()

@@ -18,7 +18,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.references import ExternalFile, runs_of_others
 from toolkit.experiment.units import outcome_of
-from toolkit.geometry import interpolate_poses, se3
+from toolkit.geometry import interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3
 from toolkit.metrics import cost, score_run
 from toolkit.report.comparison_table import report_text
 from toolkit.report.figures.comparison import draw_errors
@@ -65,12 +65,20 @@ def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording
     often_ns = np.arange(frames_t_ns[0] + 3_000_000, frames_t_ns[-1], FREQUENT_NS)
     often = Trajectory(often_ns, interpolate_poses(truth.t_ns, truth.T_world_imu, often_ns))
     run = read_as_run(tmp_path, often, recording)
+    assert "listed as final" in run.log[1]
     assert run.final is not None
     np.testing.assert_array_equal(run.final.t_ns, frames_t_ns[1:-1])  # no pose lies before the first or after the last
     # what the straight line over a hundredth of a second leaves of the path
     np.testing.assert_allclose(run.final.positions, truth.positions[1:-1], atol=1e-3)
     scores = score_run(run, "final", recording).values
     assert scores["pairs"] == recording.frame_count - 2
+
+
+def test_quaternions_of_a_euroc_file_that_are_w_last_are_named(tmp_path: Path, recording: Sequence) -> None:
+    truth = truth_of(recording)
+    rolled = np.roll(quaternion_from_rotation(truth.T_world_imu[:, :3, :3]), -1, axis=1)
+    misread = Trajectory(truth.t_ns, se3(rotation_from_quaternion(rolled), truth.positions))
+    assert "the quaternions look w last" in refusal(tmp_path, misread, recording, "euroc")
 
 
 def test_kitti_rows_are_the_frames_all_of_them_or_those_compared(tmp_path: Path, recording: Sequence) -> None:
