@@ -306,6 +306,17 @@ def test_a_fault_is_reported_with_its_size_and_error_and_the_sound_recording_is_
     assert float(match[2]) < 0.2 * abs(case.size)
 
 
+@pytest.mark.parametrize("dose", [0.02, -0.02, 0.25])
+def test_the_offset_of_the_clocks_is_measured_and_undone(dose: float) -> None:
+    sequence = clean("flight")
+    repaired = audited(faults.camera_clock, dose, "flight").sequence
+    left_s = (
+        repaired.frames_t_ns[-1]
+        - sequence.frames_t_ns[sequence.frames_t_ns.searchsorted(repaired.frames_t_ns[-1] - NS_PER_S // 40)]
+    ) / NS_PER_S
+    assert abs(left_s) < 0.01  # three standard errors of 3 ms over six seconds
+
+
 def test_a_bridge_is_as_noisy_as_its_error_and_nothing_else_is() -> None:
     sequence = clean("flight")
     repaired = audited(faults.motion_gap, 0.5, "flight").sequence

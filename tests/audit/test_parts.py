@@ -12,7 +12,6 @@ from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import camera_motion
-from toolkit.motion_samples import Pairing, TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
@@ -54,19 +53,11 @@ def test_slope_through_an_instrument_ignores_the_noise_of_the_regressor() -> Non
     assert direct.value < 0.5  # half of it lost to the noise: why the instrument is there
 
 
-@pytest.mark.parametrize(
-    ("pairing", "means"),
-    [("mean", [3.0, 10.0, 19.0]), ("start", [0.0, 38.0 / 6.0, 44.0 / 3.0]), ("end", [6.0, 86.0 / 6.0, 22.0])],
-)
-def test_interval_means_integrate_what_the_pairing_says_of_the_twists_exactly(
-    pairing: Pairing, means: list[float]
-) -> None:
-    """Straight lines, or the value at the start or end of what is between two stamps: 0, 6, 8, 18 and 24 at these."""
+def test_interval_means_integrate_straight_lines_exactly() -> None:
     t_ns = np.array([0, 3, 4, 9, 12]) * NS_PER_S
-    v_mps = np.repeat(2.0 * t_ns[:, None] / NS_PER_S, 3, axis=1)
-    twists = TwistSamples(t_ns, v_mps, np.ones((5, 3)), pairing)
-    found = interval_means(twists, np.array([1, 2, 8, 11]) * NS_PER_S)
-    np.testing.assert_allclose(found, np.column_stack([np.tile(means, (3, 1)).T, np.ones((3, 3))]), rtol=1e-12)
+    values = np.stack([2.0 * t_ns / NS_PER_S, np.ones(5)], axis=1)
+    frames_t_ns = np.array([1, 2, 8, 11]) * NS_PER_S
+    np.testing.assert_allclose(interval_means(t_ns, values, frames_t_ns), [[3, 1], [10, 1], [19, 1]], rtol=1e-12)
 
 
 @pytest.mark.parametrize("stretches", [3, 5, 10])

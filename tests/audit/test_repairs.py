@@ -1,13 +1,12 @@
 """What each repair leaves: the clean recording again, or exactly what the fault's page promises."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.audit.conftest import clean_recording, details, planted, recording, with_pixels
+from tests.audit.conftest import clean_recording, planted, recording, with_pixels
 from toolkit.audit import audit
 from toolkit.audit.alignment import is_excluded, is_there
 from toolkit.audit.robust import Scalar
@@ -163,18 +162,9 @@ def test_any_right_handed_turn_of_the_axes_is_undone(scenario: str, of_the: str,
     np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
 
 
-def test_a_camera_turned_by_no_convention_of_axes_is_reported_with_its_angle() -> None:
-    for dose in (0.25, 1.0):
-        outcome = audit(faults.turned_camera(clean_recording("drive-imu", 2), dose, 2))
-        assert "mixed-axes" not in {*details(outcome), *outcome.undecided}
-        assert "turned by" in details(outcome)["miscalibration"]
-    angle = re.search(r"turned by (\S+) \+- (\S+) rad against T_imu_cam", details(outcome)["miscalibration"])
-    assert angle is not None and float(angle[1]) == pytest.approx(1.0, abs=0.02 + 3.0 * float(angle[2]))
-
-
 def test_nothing_is_concluded_from_tracks_whose_axes_are_left_to_choose() -> None:
     """Forty tracks of an inverted extrinsic: the camera was then put elsewhere and the prior's gyro bias widened."""
-    drive = simulate(short(SCENARIOS["drive"], 6.0), 4)
+    drive = simulate(short(SCENARIOS["drive"], 10.0), 4)
     outcome = audit(faults.inverted_extrinsic(drive))
     assert [(found.fault, found.blocking) for found in outcome.findings] == [("mixed-axes", True)]
     assert "choose one" in outcome.findings[0].detail
@@ -193,8 +183,7 @@ def test_noise_does_not_make_the_mean_of_two_samples_look_right() -> None:
     """A mean has half the noise, so a least-squares lag would answer one half; this one says nothing instead."""
     clean, rng = clean_recording("drive"), np.random.default_rng(0)
     w_radps = clean.motion.w_radps + 0.05 * rng.standard_normal(clean.motion.w_radps.shape)
-    noise = replace(clean.noise, gyro_noise_density=np.full(3, 0.05 * np.sqrt(0.1)))
-    assert audit(replace(clean, motion=replace(clean.motion, w_radps=w_radps), noise=noise)).findings == ()
+    assert audit(replace(clean, motion=replace(clean.motion, w_radps=w_radps))).findings == ()
 
 
 @pytest.mark.parametrize(

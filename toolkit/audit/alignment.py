@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided, turn_of_rates
+from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided
 from toolkit.audit.robust import Scalar, chance_bound, in_motion, regression, slip_stretches
-from toolkit.geometry import Array, IntArray, skew, so3_exp, so3_log
+from toolkit.geometry import Array, IntArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
@@ -102,18 +102,13 @@ def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
 
 
 def turn_by_rotations(intervals: Intervals) -> Turn:
-    """Return the rotation that aligns the camera's rates of rotation with the gyro's, less its bias.
-
-    It is linearised at the one that fits best, however large.
-    """
-    turn, _ = turn_of_rates(intervals)
-    seen = intervals.w_cam_radps @ turn.T
+    """Return the rotation that aligns the camera's rates of rotation with the gyro's, less its bias."""
+    seen = intervals.w_seen_radps
     bias = np.tile(np.eye(3), (len(seen), 1, 1))
     response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
     found, formal = regression(response, jacobian)
     cov = jackknife_cov(_robust_solution, response, jacobian)
-    turned = found[:3] - so3_log(turn @ intervals.T_imu_cam[:3, :3].T)
-    return _tested(turned, formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES))
+    return _tested(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES))
 
 
 def _tested(rad: Array, formal: Array, cov: Array, stretches: float) -> Turn:
@@ -194,11 +189,11 @@ def force_beside_camera(sequence: Sequence, camera: CameraMotion, intervals: Int
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
     middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
-    w_radps = interval_means(motion, frames_t_ns)[:, 3:] - intervals.bias_radps
+    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - intervals.bias_radps
     v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
     t_ns, middle_at = subdivided(middle_ns)
     step_s = np.diff(t_ns)[:, None] / NS_PER_S
-    mean = interval_means(motion, t_ns)
+    mean = interval_means(motion.t_ns, motion.values, t_ns)
     half = so3_exp(0.5 * step_s * (mean[:, 3:] - intervals.bias_radps))
     R_first_imu = chained(half @ half)
     gained = np.einsum("kia,kc->kaci", R_first_imu[:-1] @ half, mean[:, :3] * step_s)

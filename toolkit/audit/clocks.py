@@ -21,11 +21,14 @@ from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
-from toolkit.motion_samples import TwistSamples
+from toolkit.models.gating import MAD_TO_SIGMA
+from toolkit.motion_samples import Pairing, TwistSamples
 from toolkit.sequence import Sequence, Truth
 
 # Range of the search, and its step in intervals.
 MOST_S, COARSE_STEP = 0.6, 0.25
+# Means over an interval that are computed at a time: they take a megabyte, however long the recording.
+MEANS_AT_A_TIME = 10_000
 REFINEMENTS = 5
 # The standard error is a jackknife's, times this factor, measured on 24 simulated drives and 8 flights.
 SCATTER = 1.45
@@ -46,19 +49,18 @@ SLOPE_STEP = 0.1
 MOST_RATE = 0.1
 # Limits of the change between the halves: standard errors, and what sound recordings have (s): 14 ms, 3 ms with an IMU.
 CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
-# The columns of the samples that are rates of rotation.
-_RATES = slice(3, 6)
+# The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
+# k plus s times sample k + 1.
+LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 
 
 def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
-    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined.
-
-    Twists are taken to describe the interval that their pairing states.
-    """
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
     step_s = usual_step_s(sequence.frames_t_ns)
-    gyro, w_imu = Integral.of(sequence.motion, _RATES), intervals.w_seen_radps
+    gyro, w_imu = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:]), intervals.w_seen_radps
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
-    costs = np.array([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, by_s)) for by_s in candidates])
+    some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
+    costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
     costs, at_zero = costs[:-1], costs[-1]
     if not np.isfinite(costs).any():
         return None
@@ -96,19 +98,36 @@ def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolA
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
 
 
-def _gyro_at(gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
-    """Return the mean rates (M, 3) of the gyro over intervals that are shifted, and which its samples cover (M,)."""
-    t_ns = sequence.frames_t_ns + round(offset_s * NS_PER_S)
-    inside = (t_ns[intervals.interval] >= gyro.t_ns[0]) & (t_ns[intervals.interval + 1] <= gyro.t_ns[-1])
-    return gyro.means(t_ns)[intervals.interval], inside
+def _gyro_at(
+    gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
+) -> tuple[Array, BoolArray]:
+    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them its samples cover (..., M).
+
+    The intervals are shifted by the offsets (...) s.
+    """
+    begin = intervals.interval - intervals.interval[0]
+    shift_ns = np.rint(np.asarray(offset_s) * NS_PER_S).astype(np.int64)[..., None]
+    t_ns = sequence.frames_t_ns[intervals.interval[0] : intervals.interval[-1] + 2] + shift_ns
+    inside = (t_ns[..., begin] >= gyro.t_ns[0]) & (t_ns[..., begin + 1] <= gyro.t_ns[-1])
+    return gyro.means(t_ns)[..., begin, :], np.asarray(inside)
 
 
-def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:
-    """Return the squared spread of the differences (M, 3) over the intervals that are covered (M,).
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
+    """Return the squared spread (C,) of the differences (C, M, 3) over the intervals that are covered (C, M).
 
     NaN where these are fewer than LEAST_INTERVALS.
     """
-    return np.nan if inside.sum() < LEAST_INTERVALS else float(np.sum(spread((w_imu - mean)[inside]) ** 2))
+    reached = inside.sum(axis=-1)
+    apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
+    deviation = MAD_TO_SIGMA * _medians(np.abs(apart - _medians(apart, reached)), reached)
+    return np.where(reached < LEAST_INTERVALS, np.nan, np.sum(deviation[..., 0] ** 2, axis=-1))
+
+
+def _medians(values: Array, reached: IntArray) -> Array:
+    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, of which a row has ``reached`` (C,)."""
+    ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
+    middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
+    return np.asarray(0.5 * (middle[0] + middle[1]))
 
 
 def _share_apart(w_imu: Array, mean: Array) -> float:
@@ -172,7 +191,6 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
     w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
     middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
     turning = sequence.motion.of(middle_ns, np.concatenate([np.zeros_like(w_radps), w_radps], axis=1))
-    turning = replace(turning, pairing="mean") if isinstance(turning, TwistSamples) else turning
     as_gyro, rows = replace(sequence, motion=turning), np.flatnonzero(camera.known)
     w_cam_radps = camera.w_radps[rows]
     seen = Intervals(rows, w_cam_radps, None, w_cam_radps, camera.v_mps[rows], sequence.rig.T_imu_cam)
@@ -217,7 +235,7 @@ def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray
     None where the truth covers too few of the rows. A fast clock lowers all rates, as a wrong focal length: that is not
     used.
     """
-    t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion, _RATES)
+    t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion.t_ns, as_gyro.motion.values[:, 3:])
     since_s = (t_ns - t_ns[0]) / NS_PER_S
     since_s = since_s - 0.5 * since_s[-1]
     shift_s, apart_s = found[0] + found[1] * since_s, SLOPE_STEP * float(np.median(np.diff(since_s)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
-from toolkit.audit.intervals import Intervals, turn_of_rates
+from toolkit.audit.intervals import Intervals
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Ranking, Scalar, cauchy, ranked, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
@@ -149,15 +149,12 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
 
     With other axes of the body the whole extrinsic is rotated, with other axes of the camera that alone. All 24
     conventions of each and the inverse are compared; turns decide between two possible positions. One is taken only if
-    the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong. None is
-    where another rotation fits the rates far better than all: the camera is turned, as `miscalibration` says.
+    the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong.
     """
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
     found = _ranked(intervals, readings)
     first, twins = found.best, _twins(readings, found.best)
-    if _by_no_convention(intervals, readings[first]):
-        return None
     second = next(k for k in found.order if k not in twins)  # the best under which the camera looks another way
     better, alone = found.behind[0], _of_rotations(intervals, given)
     certain = found.behind[second] > AGAINST_SECOND
@@ -207,18 +204,6 @@ def _readings(given: Array) -> list[ExtrinsicConvention]:
         found.append(ExtrinsicConvention(T_imu_cam, f"the camera's {axes}", cause, done, elsewhere_m))
     name, cause = "the inverse of the extrinsic", "T_imu_cam is inverted, from the IMU to the camera"
     return [*found, ExtrinsicConvention(inverse, name, cause, "the extrinsic is inverted", inverse[:3, 3])]
-
-
-def _by_no_convention(intervals: Intervals, best: ExtrinsicConvention) -> bool:
-    """Say whether the rotation that fits the rates best is another than that of the best convention, and far better."""
-    turn, _ = turn_of_rates(intervals)
-    turned = best._replace(T_imu_cam=se3(turn, best.T_imu_cam[:3, 3]))
-    apart = best.T_imu_cam[:3, :3].T @ turn
-    return bool(
-        np.linalg.norm(so3_log(apart)) > SAME_WAY_RAD
-        and _ranked(intervals, [best, turned]).behind[0] > AGAINST_GIVEN
-        and _of_rotations(intervals, turned.T_imu_cam) == _OWN
-    )
 
 
 def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:

@@ -11,7 +11,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3_e
 from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.noise import white_sigma
-from toolkit.motion_samples import ImuSamples, MotionSamples, NoSamples, Pairing, TwistSamples
+from toolkit.motion_samples import ImuSamples, NoSamples, TwistSamples
 from toolkit.sequence import Sequence, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.
@@ -74,7 +74,7 @@ def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
     rows = np.flatnonzero(camera.known)
     if isinstance(sequence.motion, NoSamples) or rows.size < LEAST_INTERVALS:
         return None
-    mean = interval_means(sequence.motion, sequence.frames_t_ns)[rows]
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)[rows]
     v_mps = mean[:, :3] if isinstance(sequence.motion, TwistSamples) else None
     seen = camera.w_radps[rows], camera.v_mps[rows], sequence.rig.T_imu_cam
     return Intervals(rows, mean[:, 3:], v_mps, *seen)
@@ -89,44 +89,32 @@ def is_comparable(sequence: Sequence) -> bool:
     return True
 
 
-# The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
-# k plus s times sample k + 1.
-LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
-
-
 class Integral(NamedTuple):
-    """The measured motion from each stamp (S,) to the next, and its integral (S, d) up to each.
+    """Samples (S, d) at stamps (S,), linear between them and constant beyond the ends, and their integral up to each.
 
-    It changes linearly from ``begin`` (S, d) to ``end`` (S, d): from one sample to the next, or both are the twist that
-    by its pairing describes all of the interval. Beyond the last stamp it is constant. Once the integral is computed,
-    the time for means over intervals depends on their number only.
+    Once it is computed, the time for means over intervals depends on their number only.
     """
 
     t_ns: IntArray
-    begin: Array
-    end: Array
+    values: Array
     up_to: Array
 
     @classmethod
-    def of(cls, motion: MotionSamples, columns: slice = slice(None)) -> "Integral":
-        values = motion.values[:, columns]
-        pairing = motion.pairing if isinstance(motion, TwistSamples) else "mean"
-        begin = np.concatenate([values[1:] if pairing == "end" else values[:-1], values[-1:]])
-        end = np.concatenate([values[:-1] if pairing == "start" else values[1:], values[-1:]])
-        pieces = 0.5 * (begin + end)[:-1] * (np.diff(motion.t_ns) / NS_PER_S)[:, None]
-        return cls(motion.t_ns, begin, end, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)]))
+    def of(cls, t_ns: IntArray, values: Array) -> "Integral":
+        pieces = 0.5 * (values[1:] + values[:-1]) * (np.diff(t_ns) / NS_PER_S)[:, None]
+        return cls(t_ns, values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)]))
 
     def means(self, frames_t_ns: IntArray) -> Array:
-        """Return the mean (K - 1, d) over each interval between stamps (K,)."""
-        return np.asarray(np.diff(self._at(frames_t_ns), axis=0) / (np.diff(frames_t_ns) / NS_PER_S)[:, None])
+        """Return the mean (..., K - 1, d) over each interval between stamps (..., K)."""
+        return np.asarray(np.diff(self._at(frames_t_ns), axis=-2) / (np.diff(frames_t_ns) / NS_PER_S)[..., None])
 
     def _at(self, t_ns: IntArray) -> Array:
         row = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, len(self.t_ns) - 1)
         following = np.minimum(row + 1, len(self.t_ns) - 1)
-        since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[:, None]
-        step_s = np.maximum(self.t_ns[following] - self.t_ns[row], 1)[:, None] / NS_PER_S
-        slope = np.where(since_s > 0.0, (self.end[row] - self.begin[row]) / step_s, 0.0)
-        return np.asarray(self.up_to[row] + since_s * (self.begin[row] + 0.5 * since_s * slope))
+        since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[..., None]
+        step_s = np.maximum(self.t_ns[following] - self.t_ns[row], 1)[..., None] / NS_PER_S
+        slope = np.where(since_s > 0.0, (self.values[following] - self.values[row]) / step_s, 0.0)
+        return np.asarray(self.up_to[row] + since_s * (self.values[row] + 0.5 * since_s * slope))
 
 
 def chained(step: Array) -> Array:
@@ -137,9 +125,9 @@ def chained(step: Array) -> Array:
     return products
 
 
-def interval_means(motion: MotionSamples, frames_t_ns: IntArray) -> Array:
-    """Return the mean (K - 1, d) of motion samples over each interval between frames (K,) ns."""
-    return Integral.of(motion).means(frames_t_ns)
+def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Array:
+    """Return the mean (K - 1, d) over each interval between frames of linearly interpolated samples (S, d)."""
+    return Integral.of(t_ns, values).means(frames_t_ns)
 
 
 def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
@@ -156,7 +144,7 @@ def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
 
 def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
     """Return the camera's motion (K - 1, 4, 4) by the motion samples and an extrinsic, less the gyro's bias."""
-    mean = interval_means(sequence.motion, sequence.frames_t_ns)
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     w_radps, v_mps = mean[:, 3:], mean[:, :3]
     R_imu_cam = T_imu_cam[:3, :3]
     bias_radps = np.median((w_radps - camera.w_radps @ R_imu_cam.T)[camera.known], axis=0)
@@ -185,26 +173,17 @@ FROM_SCATTER = 0.5
 def rotation_ratio(intervals: Intervals) -> Scalar:
     """Return the ratio of the samples' rates of rotation to the camera's, independent of their axes.
 
-    The noise of the samples does not bias it.
-    """
-    measured, seen = (w - np.median(w, axis=0) for w in (intervals.w_radps, intervals.w_cam_radps))
-    total = float(np.sum(seen**2))
-    if not total > 0.0:
-        return Scalar(1.0, np.inf)
-    turn, overlap = turn_of_rates(intervals)
-    turned, scale = seen @ turn.T, overlap / total
-    moment = np.sum(turned * (measured - scale * turned), axis=1)
-    return Scalar(scale, float(np.sqrt(np.sum(moment**2))) / total)
-
-
-def turn_of_rates(intervals: Intervals) -> tuple[Array, float]:
-    """Return the rotation (3, 3) of the camera's rates of rotation that fits the samples' best, and their product then.
-
-    It is that of the similarity between the rates less their medians (Umeyama 1991, eqs. 39-42).
+    It is the scale of the similarity between the rates less their medians (Umeyama 1991, eqs. 39-42), which the noise
+    of the samples does not bias.
     """
     measured, seen = (w - np.median(w, axis=0) for w in (intervals.w_radps, intervals.w_cam_radps))
     turn, overlaps = nearest_rotation(measured.T @ seen)
-    return turn, float(overlaps.sum())
+    total = float(np.sum(seen**2))
+    if not total > 0.0:
+        return Scalar(1.0, np.inf)
+    turned, scale = seen @ turn.T, float(overlaps.sum()) / total
+    moment = np.sum(turned * (measured - scale * turned), axis=1)
+    return Scalar(scale, float(np.sqrt(np.sum(moment**2))) / total)
 
 
 def speed_ratio(intervals: Intervals | None) -> Scalar | None:

@@ -21,7 +21,7 @@ from toolkit.models.stereo import project, projection_jacobian, triangulate
 from toolkit.sequence import Sequence
 
 # Median one-step residual (px) beyond which samples and tracks disagree; sound recordings have 0.3 to 3.1 px.
-MOST_PX = 3.1
+MOST_PX = 3.0
 # The limit is no less than this many times what the tracks' own scatter and the stated noise of the samples explain.
 TIMES_EXPLAINED = 2.0
 # Residuals beyond this many robust standard deviations are left out of the correlation, which needs so many pairs.

@@ -558,7 +558,8 @@ def _baseline(evidence: Evidence) -> _WrongUnit | None:
     ratio = speed_ratio(evidence.intervals)
     summary = f"baseline_m is {rig.baseline_m:g}, which no rig has"
     if ratio is not None:
-        unit = _in_other_unit(ratio, {unit: 1.0 / LENGTHS[unit] for unit in fitting})
+        measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
+        unit = _in_other_unit(ratio, measured, WITHIN_FACTOR, UNIT_SIGMAS)
         fitting = [unit] if unit is not None else []
         summary += f", and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
     if len(fitting) != 1:
@@ -596,7 +597,7 @@ def _of_samples(evidence: Evidence, quantity: Quantity) -> _WrongUnit | None:
     if quantity is FORCE and _lacks_gravity(sequence):
         return None
     ratio = quantity.ratio_of(sequence, intervals)
-    unit = None if ratio is None else _in_other_unit(ratio, quantity.units, quantity.within)
+    unit = None if ratio is None else _in_other_unit(ratio, quantity.units, quantity.within, UNIT_SIGMAS)
     if ratio is None or unit is None:
         return None
     factor, summary = quantity.units[unit], f"{quantity.summary.format(*ratio)}: it is in {unit}"
@@ -623,7 +624,7 @@ def _truth(evidence: Evidence) -> _WrongUnit | None:
     rows = inside[intervals.interval] & inside[intervals.interval + 1]
     measured = intervals.v_cam_mps if intervals.v_mps is None else intervals.v_mps
     ratio = ratio_of_speeds(v_true[intervals.interval[rows]], measured[rows])
-    unit = None if ratio is None else _in_other_unit(ratio, LENGTHS)
+    unit = None if ratio is None else _in_other_unit(ratio, LENGTHS, WITHIN_FACTOR, UNIT_SIGMAS)
     if ratio is None or unit is None:
         return None
     scale = 1.0 / LENGTHS[unit]
@@ -634,9 +635,9 @@ def _truth(evidence: Evidence) -> _WrongUnit | None:
     return (summary, remedy)
 
 
-def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float = WITHIN_FACTOR) -> str | None:
+def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
     """Return the only unit whose factor a ratio matches; None where none does, several do, or the ratio may be 1."""
-    if not ratio.value > 0.0 or abs(ratio.value - 1.0) < UNIT_SIGMAS * ratio.error:
+    if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
         return None
     apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}
     near = [unit for unit in apart if apart[unit] < np.log(within_factor)]

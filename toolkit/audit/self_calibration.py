@@ -73,6 +73,33 @@ class Strides(NamedTuple):
     whitener: Array
     inertial: float
 
+    def equations(
+        self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
+    ) -> tuple[Array, Array]:
+        """Return the residuals (m, 9), rotation, velocity and position, and their Jacobian (m, 9, 27) by the unknowns.
+
+        States are m + 1 attitudes (m + 1, 3, 3), positions and velocities (m + 1, 3) in the axes of the first, with
+        gravity (3,). Unknowns are the states at both ends (9 each), gravity and the biases (6,).
+        """
+        R_a_b = self.R_a_b @ so3_exp(self.d_turn @ bias)
+        gained, way = self.faster + self.d_faster @ bias, self.moved + self.d_moved @ bias
+        dt_s, one = self.dt_s[:, None], np.eye(3)
+        R_first_a, R_first_b = R_first_imu[:-1], R_first_imu[1:]
+        R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
+        turn = so3_log(R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
+        faster = velocity[1:] - velocity[:-1] - gravity * dt_s - _applied(R_first_a, gained)
+        moved = position[1:] - position[:-1] - _applied(R_first_a, way)
+        moved -= self.inertial * (velocity[:-1] * dt_s + 0.5 * gravity * dt_s**2)
+        d = np.zeros((len(dt_s), 9, 27))
+        d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -self.d_turn
+        d[:, 3:6, :3], d[:, 3:6, 6:9], d[:, 3:6, 15:18] = R_first_a @ skew(gained), -one, one
+        d[:, 3:6, 18:21], d[:, 3:6, 21:] = -dt_s[:, :, None] * one, -R_first_a @ self.d_faster
+        d[:, 6:, :3], d[:, 6:, 3:6], d[:, 6:, 12:15] = R_first_a @ skew(way), -one, one
+        of_fall = -self.inertial * dt_s[:, :, None] * one
+        d[:, 6:, 6:9], d[:, 6:, 18:21] = of_fall, 0.5 * dt_s[:, :, None] * of_fall
+        d[:, 6:, 21:] = -R_first_a @ self.d_moved
+        return -np.concatenate([turn, faster, moved], axis=1), d
+
 
 def imu_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> Strides:
     """Preintegrate an IMU's samples about a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
@@ -314,29 +341,9 @@ def _strides(window: KeyFrameWindow, calibration: Calibration) -> tuple[Array, A
 
 
 def stride_equations(window: KeyFrameWindow, calibration: Calibration) -> tuple[Array, Array]:
-    """Return the residuals (m, 9) of the strides, rotation, velocity and position, and their Jacobian (m, 9, 27).
-
-    Unknowns are the states at both ends of a stride (9 each), gravity and the biases (6,).
-    """
-    strides, bias, gravity = window.strides, calibration.bias, window.gravity
-    R_a_b = strides.R_a_b @ so3_exp(strides.d_turn @ bias)
-    gained, way = strides.faster + strides.d_faster @ bias, strides.moved + strides.d_moved @ bias
-    dt_s, one = strides.dt_s[:, None], np.eye(3)
-    R_first_a, R_first_b = window.R_first_imu[:-1], window.R_first_imu[1:]
-    R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
-    turn = so3_log(R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
-    faster = np.diff(window.velocity, axis=0) - gravity * dt_s - _applied(R_first_a, gained)
-    moved = np.diff(window.position, axis=0) - _applied(R_first_a, way)
-    moved -= strides.inertial * (window.velocity[:-1] * dt_s + 0.5 * gravity * dt_s**2)
-    d = np.zeros((len(dt_s), 9, 27))
-    d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -strides.d_turn
-    d[:, 3:6, :3], d[:, 3:6, 6:9], d[:, 3:6, 15:18] = R_first_a @ skew(gained), -one, one
-    d[:, 3:6, 18:21], d[:, 3:6, 21:] = -dt_s[:, :, None] * one, -R_first_a @ strides.d_faster
-    d[:, 6:, :3], d[:, 6:, 3:6], d[:, 6:, 12:15] = R_first_a @ skew(way), -one, one
-    of_fall = -strides.inertial * dt_s[:, :, None] * one
-    d[:, 6:, 6:9], d[:, 6:, 18:21] = of_fall, 0.5 * dt_s[:, :, None] * of_fall
-    d[:, 6:, 21:] = -R_first_a @ strides.d_moved
-    return -np.concatenate([turn, faster, moved], axis=1), d
+    """Return the residuals (m, k) of the strides and their derivatives (m, k, j) by states, gravity and biases."""
+    attitudes, position, velocity = window.R_first_imu, window.position, window.velocity
+    return window.strides.equations(attitudes, position, velocity, window.gravity, calibration.bias)
 
 
 def _applied(matrix: Array, vector: Array) -> Array:
@@ -540,7 +547,7 @@ def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
     count, most = len(spans), MOST[sequence.motion_kind].windows
     if sequence.motion_kind == "imu" or count <= most:
         return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
-    mean = interval_means(sequence.motion, sequence.frames_t_ns)[:, 3:]
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
     rates = mean - np.median(mean, axis=0)
     turned = [float(np.linalg.norm(rates[span[0] : span[-1]], axis=1).sum()) for span in spans]
     return sorted(int(k) for k in np.argsort(turned)[-most:])
@@ -612,5 +619,5 @@ def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:
 
 def _rates(sequence: Sequence, keys: IntArray) -> Array:
     """Return the gyro's means (n, 3) rad/s over the two intervals around each of the frames (n,)."""
-    mean = interval_means(sequence.motion, sequence.frames_t_ns)[:, 3:]
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
     return np.asarray(0.5 * (mean[np.maximum(keys - 1, 0)] + mean[np.minimum(keys, len(mean) - 1)]))

@@ -6,26 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.clocks import camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
+from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
-from toolkit.audit.intervals import (
-    LAG,
-    LEAST_INTERVALS,
-    Integral,
-    Intervals,
-    is_comparable,
-    stated_densities,
-    turn_of_rates,
-    usual_step_s,
-)
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities, usual_step_s
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
-from toolkit.audit.self_calibration import CHANGE, LATE, self_calibration
-from toolkit.geometry import Array, BoolArray, IntArray, se3
+from toolkit.audit.self_calibration import CHANGE, LATE, SelfCalibration, self_calibration
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.motion_samples import Bridges, MotionSamples, NoSamples, Pairing, TwistSamples
+from toolkit.motion_samples import Bridges, MotionSamples, NoSamples, TwistSamples
 from toolkit.sequence import Sequence
 
 # A step this many times the usual (median) one is a gap: one missing stamp makes a step of 2, two make 3.
@@ -487,35 +478,32 @@ def _share_followed(regressor: Array, response: Array) -> float:
     return slope(regressor, regressor, response).value
 
 
-# With a larger standard error of the lag, in intervals, it is undecided; one that differs from the present pairing's by
-# so many of them is used up to twice that.
-LARGEST_LAG_ERROR, LAG_SIGMAS = 0.1, 5.0
+# Largest standard error of the lag, in intervals, and how many of them it must differ by from the present pairing's.
+LARGEST_LAG_ERROR = 0.1
+LAG_SIGMAS = 5.0
 
 
 def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     """Estimate which interval a twist describes, and pair the samples by the nearest of start, mean and end.
 
     With w_k the sample and c_k the camera's rotation over k -> k + 1, c_k = (1 - s) w_k + s w_(k+1) has a lag s of 0
-    where the sample at the start describes the interval, 1 at the end. It is the offset of the clocks (`clocks`), in
-    the axes in which the rates agree best, because those of the extrinsic are judged with samples that are paired.
+    where the sample at the start describes the interval, 1 at the end, 1/2 without an offset of the clocks (`clocks`).
     """
     sequence, intervals = evidence.sequence, evidence.intervals
     if not isinstance(sequence.motion, TwistSamples):
         return None
     if intervals is None:
         return evidence.blind
-    T_imu_cam = se3(turn_of_rates(intervals)[0], np.zeros(3))
-    found = camera_offset(sequence, intervals._replace(T_imu_cam=T_imu_cam)) if is_stamped_at_frames(sequence) else None
+    found = camera_offset(sequence, intervals) if is_stamped_at_frames(sequence) else None
     if found is None:
         return Undecided("too little change of rotation, or too few frames with a twist of the same stamp")
     step_s = usual_step_s(sequence.motion.t_ns)
-    present = sequence.motion.pairing
-    lag = Scalar(LAG[present] + found.value / step_s, found.error / step_s)
-    excluded = abs(lag.value - LAG[present]) > LAG_SIGMAS * lag.error
-    if lag.error > LARGEST_LAG_ERROR * (2.0 if excluded else 1.0):
+    lag = Scalar(0.5 + found.value / step_s, found.error / step_s)
+    if lag.error > LARGEST_LAG_ERROR:
         return Undecided(f"too little change of rotation: the lag is {lag.value:.1f} +- {lag.error:.1f} of an interval")
+    present = sequence.motion.pairing
     nearest = min(LAG, key=lambda pairing: abs(LAG[pairing] - lag.value))
-    if nearest == present or not excluded:
+    if nearest == present or abs(lag.value - LAG[present]) < LAG_SIGMAS * lag.error:
         return None
     seen = f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval after its start"
     return Symptom(
@@ -527,8 +515,8 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 # An offset is reported beyond this many standard errors and what is no fault: a sample of an IMU may describe the
-# interval before or after its stamp; a twist stamped at the frames may be so many intervals late, under any pairing.
-OFFSET_SIGMAS, LEAST_OFFSET_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.0
+# interval before or after its stamp; so may a twist, and be one interval late.
+OFFSET_SIGMAS, LEAST_OFFSET_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
 # From this many standard errors on an offset with an IMU is undecided; sound recordings have 3.1 at most.
 DOUBTFUL_SIGMAS = 3.2
 # The same limit, in intervals, for twists stamped between the frames, whose pairing looks like an offset.
@@ -552,48 +540,32 @@ ONE_CLOCK = "a clock drifts or was set: stamp both by one clock, or cut the reco
 def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Find the offset of the frames' stamps by rotations (`clocks`), and shift the frames by it.
 
-    What another pairing of twists explains is no offset: at the frames `twist_lag` has chosen it, between them it stays
-    undecided. Frames are not shifted where the halves differ, where velocities then fit worse (the rates of rotation
-    alone are late), nor where the same fit finds another offset afterwards.
+    Twists stamped at the frames have a pairing (`twist_lag`); what that explains is no offset. Frames are not shifted
+    where the halves differ, nor where velocities then fit worse: the rates of rotation alone are late.
     """
     sequence = evidence.sequence
     at_frames, is_twist = is_stamped_at_frames(sequence), isinstance(sequence.motion, TwistSamples)
     found = _refined(camera_offset(sequence, intervals), evidence)
     if found is None:
         return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
-    offset_s, largest_s = found.value, LARGEST_TWIST_ERROR_S if is_twist else LARGEST_ERROR_S
-    least_s = max(_least_offset_s(sequence, at_frames), OFFSET_SIGMAS * found.error)
+    expected_s, least_s = _expected(sequence)
+    offset_s, largest_s = found.value - expected_s, LARGEST_TWIST_ERROR_S if is_twist else LARGEST_ERROR_S
+    beyond_s = found.value if at_frames else offset_s
     surely_s = largest_s * (1.0 if at_frames else LARGEST_BEYOND)
-    pairing, nearest_s = _by_nearest_pairing(sequence, offset_s, at_frames)
-    if abs(nearest_s) < least_s <= abs(offset_s) and found.error <= surely_s and not at_frames:
-        late = f"{'late' if offset_s < 0.0 else 'early'} by {1e3 * abs(offset_s):.0f} +- {1e3 * found.error:.0f} ms"
-        why = f'frames look as if stamped {late}, or as if twists belonged to the "{pairing}" of an interval'
-        return Undecided(f"{why}: stamp both by one clock")
-    if abs(nearest_s) < least_s or found.error > surely_s:
-        return _as_often(sequence, found) or _unseen_offset(found, largest_s, is_twist)
-    return _shift_of_clocks(evidence, intervals, found)
-
-
-def _shift_of_clocks(evidence: Evidence, intervals: Intervals, found: Scalar) -> Symptom | Undecided:
-    """Report an offset of the clocks, and shift the frames by it unless the data contradict that."""
-    sequence, offset_s = evidence.sequence, found.value
+    if abs(beyond_s) < max(least_s, OFFSET_SIGMAS * found.error) or found.error > surely_s:
+        return _as_often(sequence, Scalar(offset_s, found.error)) or _unseen_offset(found, largest_s, is_twist)
     by = f"{1e3 * offset_s:.1f} +- {1e3 * found.error:.1f} ms"
     seen = f"the camera turns as the gyro does when the frames' stamps are shifted by {by}"
     detail = f"{seen}: frames are stamped {'late' if offset_s < 0.0 else 'early'}"
-    remedy = _shifted(sequence, offset_s)
-    after = evidence.after(remedy)
-    change = _fitted_change(after) or change_of_offset(sequence, intervals)
+    change = change_of_offset(sequence, intervals)
     if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
         parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms more in the second half than in the first"
         return Symptom.warning(f"{detail}, but by {parted}", ONE_CLOCK)
-    if (worse := _velocities_against(sequence, intervals, offset_s)) > AGAINST_SHIFT:
+    remedy = _shifted(sequence, offset_s)
+    if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
         fit_worse = f"the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
         why = "stamp rates of rotation and velocities by one clock, the camera's"
         return Symptom.warning(f"{seen}, but then {fit_worse}", why)
-    left = _left(after) if sequence.motion_kind == "imu" else Scalar(0.0, 0.0)
-    if left is None or abs(left.value) > max(LEAST_OFFSET_S, DOUBTFUL_SIGMAS * left.error):
-        more = "" if left is None else f", but {1e3 * left.value:.1f} +- {1e3 * left.error:.1f} ms"
-        return Undecided(f"{seen}, and tracks and IMU do not fit then{more}")
     return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
 
 
@@ -610,32 +582,18 @@ def _unseen_offset(found: Scalar, largest_s: float, is_twist: bool) -> Undecided
     return Undecided(f"frames look as if stamped {late} by {seen}, and {why}")
 
 
-def _velocities_against(sequence: Sequence, intervals: Intervals, offset_s: float) -> float:
-    """Return by how many standard errors the twists' velocities fit the camera's worse after the frames are shifted.
-
-    Those of twists stamped at the frames count before it under the pairing that fits best: it may be undecided.
-    """
-    motion = sequence.motion
-    if not isinstance(motion, TwistSamples):
+def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) -> float:
+    """Return by how many standard errors the twists' velocities fit the camera's worse after the frames are shifted."""
+    before, after = evidence.intervals, evidence.after(shifted).intervals
+    if before is None or after is None or before.v_mps is None or after.v_mps is None:
         return 0.0
-    t_ns, offset_ns, step_ns = sequence.frames_t_ns, round(offset_s * NS_PER_S), usual_step_s(motion.t_ns) * NS_PER_S
-
-    # Of means over three samples, linear between, the noise does not depend on when between the samples frames are.
-    padded = np.pad(motion.values, ((1, 1), (0, 0)), "edge")
-    smooth = motion.of(motion.t_ns, 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:])
-
-    def measured(pairing: Pairing) -> Integral:
-        middles_ns = motion.t_ns + round((0.5 - LAG[pairing]) * step_ns)
-        return Integral.of(replace(smooth, t_ns=middles_ns, pairing="mean"), slice(0, 3))
-
-    pairings = list(LAG) if is_stamped_at_frames(sequence) else [motion.pairing]
-    means = [measured(pairing).means(t_ns) for pairing in pairings]
-    means.append(measured(motion.pairing).means(t_ns + offset_ns))
-    inside = (t_ns + offset_ns >= motion.t_ns[0]) & (t_ns + offset_ns <= motion.t_ns[-1])
-    rows = inside[intervals.interval] & inside[intervals.interval + 1]
-    seen_mps = (intervals.v_seen_mps - np.cross(intervals.w_seen_radps, intervals.T_imu_cam[:3, 3]))[rows]
-    *before, after = cauchy(np.stack(means)[:, intervals.interval[rows]] - seen_mps, LEAST_SPREAD_V)
-    return mean_in_sigmas(after - min(before, key=np.mean))
+    stamps_ns = shifted.frames_t_ns - round(offset_s * NS_PER_S)
+    _, here, there = np.intersect1d(
+        evidence.sequence.frames_t_ns[before.interval], stamps_ns[after.interval], return_indices=True
+    )
+    seen = before.v_seen_mps - np.cross(before.w_seen_radps, before.T_imu_cam[:3, 3])
+    costs = cauchy(np.stack([before.v_mps[here] - seen[here], after.v_mps[there] - seen[here]]), LEAST_SPREAD_V)
+    return mean_in_sigmas(costs[1] - costs[0])
 
 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
@@ -644,23 +602,23 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
     Its model is linear in the delay: 20 ms of a shaken camera are off by a quarter. Where that does not converge, the
     offset of the rotations is returned.
     """
-    if found is None:
-        return None
-    shift_s = found.value if abs(found.value) > NEAR_S else 0.0
+    if found is None or (fitted := evidence.self_calibration) is None:
+        return found
+    shift_s = 0.0
+    if abs(found.value) > NEAR_S and (shifted := _fitted_after(evidence, found.value)) is not None:
+        shift_s, fitted = found.value, shifted
     for _ in range(SHIFTS):
-        left = _left(evidence.after(_shifted(evidence.sequence, shift_s)) if shift_s else evidence)
-        if left is None:
-            return found
-        shift_s += left.value
-        if abs(left.value) < LEAST_OFFSET_S:
-            return Scalar(shift_s, left.error)
+        shift_s += float(fitted.value[LATE])
+        if abs(fitted.value[LATE]) < LEAST_OFFSET_S:
+            return Scalar(shift_s, float(fitted.error[LATE]))
+        if (shifted := _fitted_after(evidence, shift_s)) is None:
+            break
+        fitted = shifted
     return found
 
 
-def _left(evidence: Evidence) -> Scalar | None:
-    """Return the offset by the self-calibration with an IMU; None where it fails."""
-    fitted = evidence.self_calibration
-    return None if fitted is None else Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
+def _fitted_after(evidence: Evidence, shift_s: float) -> SelfCalibration | None:
+    return evidence.after(_shifted(evidence.sequence, shift_s)).self_calibration
 
 
 def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
@@ -695,22 +653,15 @@ def _constant_phase_s(sequence: Sequence) -> float | None:
     return phase_ns / NS_PER_S if tolerance < phase_ns < step_ns - tolerance else None
 
 
-def _by_nearest_pairing(sequence: Sequence, offset_s: float, at_frames: bool) -> tuple[str, float]:
-    """Return the pairing of twists that leaves the least offset (s), and that; between frames a stated one stays."""
-    motion = sequence.motion
-    if not isinstance(motion, TwistSamples) or not (at_frames or motion.pairing == TwistSamples.pairing):
-        return "", offset_s
-    step_s, stated = usual_step_s(motion.t_ns), LAG[motion.pairing]
-    left_s = {pairing: offset_s - (lag - stated) * step_s for pairing, lag in LAG.items()}
-    return min(left_s.items(), key=lambda one: abs(one[1]))
-
-
-def _least_offset_s(sequence: Sequence, at_frames: bool) -> float:
-    """Return the offset (s) from which on it is a fault."""
+def _expected(sequence: Sequence) -> tuple[float, float]:
+    """Return the offset (s) that the pairing of twists implies, and the largest difference that is no fault."""
     if not isinstance(sequence.motion, TwistSamples):
-        return LEAST_OFFSET_S
+        return 0.0, LEAST_OFFSET_S
     step_s = usual_step_s(sequence.motion.t_ns)
-    return LEAST_TWIST_INTERVALS * step_s if at_frames else max(LEAST_OFFSET_S, LEAST_OFF_FRAMES * step_s)
+    least_s = max(LEAST_OFFSET_S, LEAST_OFF_FRAMES * step_s)
+    if is_stamped_at_frames(sequence):
+        least_s = LEAST_TWIST_INTERVALS * step_s
+    return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
 
 
 def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
@@ -730,7 +681,7 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
 
     With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by rotations.
     """
-    found = _fitted_change(evidence) or change_of_offset(evidence.sequence, intervals)
+    found = _fitted_change(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
     if found is None:
         return Undecided("too little change of rotation in half of the recording: whether the clocks drift is unknown")
     change_s, error_s = found.value, found.error
@@ -744,11 +695,11 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     return Symptom.warning(f"the offset of frames and motion samples changes by {by}", ONE_CLOCK)
 
 
-def _fitted_change(evidence: Evidence) -> Scalar | None:
+def _fitted_change(evidence: Evidence, intervals: Intervals) -> Scalar | None:
     """Return the change (s) by the self-calibration; rotations of half a short recording may agree at a wrong shift."""
     found = evidence.self_calibration
-    if found is not None and evidence.intervals is not None and found.windows == 1:
-        found = self_calibration(evidence.sequence, evidence.camera_motion, evidence.intervals, fewest_windows=2)
+    if found is not None and found.windows == 1:
+        found = self_calibration(evidence.sequence, evidence.camera_motion, intervals, fewest_windows=2)
     if found is None or found.windows == 1:
         return None
     return Scalar(float(found.value[CHANGE]), float(found.error[CHANGE]))

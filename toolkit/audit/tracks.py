@@ -99,7 +99,7 @@ def _moving_by_samples(sequence: Sequence) -> BoolArray:
     """Say for each interval (K - 1,) whether, by the samples, the image rotates by pixels or the vehicle drives."""
     if sequence.motion_kind == "none" or not is_comparable(sequence):
         return np.zeros(max(sequence.frame_count - 1, 0), dtype=bool)
-    mean = interval_means(sequence.motion, sequence.frames_t_ns)
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
     with np.errstate(over="ignore"):  # by a sample that `implausible` will drop
         speed_mps, rate_radps = np.linalg.norm(mean[:, :3], axis=1), np.linalg.norm(mean[:, 3:], axis=1)

@@ -159,7 +159,7 @@ def _measured(sequence: Sequence, truth: Truth) -> Array | None:
     t_ns = np.linspace(begin_ns, end_ns, round(READ_HZ * duration_s) + 1).astype(np.int64)
     poses, step_s = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns), np.diff(t_ns)[:, None] / NS_PER_S
     R_world_imu = poses[:, :3, :3]
-    mean = interval_means(sequence.motion, t_ns)
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, t_ns)
     seen, turned = mean[:, 3:], so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
     apart = turned - seen
     apart, seen = apart - np.median(apart, axis=0), seen - np.median(seen, axis=0)
