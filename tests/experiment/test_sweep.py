@@ -176,7 +176,7 @@ def test_functions_of_ones_own_are_swept_beside_what_is_named(short):
         ({"fault:fog": [1.0]}, "fog"),
         ({FRAMES: [0.0]}, "no value to vary it over"),
         ({"window.lag": [1.0]}, "no setting window.lag"),
-        ({"seeds": [3]}, "seeds: no run depends on it"),
+        ({"seeds": [3]}, "seeds: a sweep sets it itself, or no run depends on it"),
     ],
 )
 def test_what_cannot_be_swept_is_told_in_a_line(short, over, what):

@@ -77,9 +77,9 @@ class Axis:
                 raise SettingsError(f"{name}: {wrong[0]!r} is no dose; give numbers, in {one.unit}")
             axis = cls(name, tuple(sorted(map(float, given))), one.clean, one.unit, one.meaning)
         else:
-            if name in ("first_seed", "seeds", "card") or name.startswith("metrics."):
-                raise SettingsError(f"{name}: no run depends on it; name another setting")
             about = next((setting for setting in describe() if setting.key == name), None)
+            if about and (name in ("first_seed", "seeds", "card") or name.startswith("metrics.")):
+                raise SettingsError(f"{name}: a sweep sets it itself, or no run depends on it; name another setting")
             unit, meaning = ("", "an option of an estimator") if about is None else (about.unit, about.meaning)
             axis = cls(name, given, value_at(as_values(plan.settings), name), unit, meaning)
         varied = tuple(value for value in axis.values if value != axis.clean)

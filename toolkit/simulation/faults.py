@@ -66,7 +66,9 @@ def planted(sequence: Sequence, doses: Doses, seed: int) -> Sequence:
         own_seed = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
         try:
             sequence = INJECTORS[name].plant(sequence, dose, own_seed)
-        except (ValueError, MemoryError) as error:  # NumPy's, of a dose that is below zero or out of all bounds
+            if sequence.frame_count < 2:
+                raise ValueError("no recording is left")
+        except (ValueError, OverflowError, MemoryError) as error:  # NumPy's, of a dose that is out of all bounds
             unit = INJECTORS[name].unit
             raise DataError(f"{name}: a dose of {dose:g} {unit} cannot be planted ({error}); name another") from error
     return sequence
