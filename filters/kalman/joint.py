@@ -314,8 +314,10 @@ def innovation(
     roots, m = np.sqrt(weights[rows])[:, None, None], 3 * rows.size
     H_pose, H_point = roots * seen.H_pose[rows], roots * seen.H_point[rows]
     cross = (roots * cross_covs[rows]).reshape(m, -1)
-    of_points = cross[:, joint.landmark_columns].reshape(m, -1, 3)[:, rows].swapaxes(0, 1) @ H_point.mT
-    cov = of_points.swapaxes(0, 1).reshape(m, m) + cross[:, -6:] @ H_pose.reshape(m, 6).T + np.eye(m)
+    # Transposed, so that each landmark's columns are a matrix in one piece.
+    of_points = H_point @ np.ascontiguousarray(cross[:, joint.landmark_columns].T).reshape(-1, 3, m)[rows]
+    cov = of_points.reshape(m, m) + H_pose.reshape(m, 6) @ cross[:, -6:].T
+    cov.flat[:: m + 1] += 1.0
     return cross, cov, (roots[..., 0] * seen.residuals[rows]).ravel()
 
 

@@ -95,8 +95,9 @@ def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
         if not files:
             raise DataError(f"{path}: it holds no trajectory")
         had = found.get(name or _name(path), {}).get(_name(truth), ())
-        if twice := {one.resolve() for one in had} & {one.resolve() for one in files}:
-            raise DataError(f"{min(twice)}: it is given twice, and would count as two runs; keep one")
+        seen = {one.resolve() for one in had}
+        if twice := [one for one in files if one.resolve() in seen]:
+            raise DataError(f"{twice[0]}: it is given twice, and would count as two runs; keep one")
         found[name or _name(path)] = {_name(truth): (*had, *files)}
     return found
 

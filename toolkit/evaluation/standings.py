@@ -127,13 +127,17 @@ class EvaluatedSystems:
     @cached_property
     def cells(self) -> Mapping[tuple[str, str], OverRuns]:
         """The runs by system and sequence; every pair of the two has some."""
+        return {pair: self._over_runs(*pair, runs) for pair, runs in self._runs_of.items()}
+
+    @cached_property
+    def _runs_of(self) -> Mapping[tuple[str, str], list[RunRecord]]:
         found: dict[tuple[str, str], list[RunRecord]] = {}
         for run in self.runs:
             found.setdefault((run.estimator, run.sequence), []).append(run)
-        return {pair: self._over_runs(*pair, runs) for pair, runs in found.items()}
+        return found
 
     def ok_runs(self, system: str, sequence: str) -> list[RunRecord]:
-        return [run for run in self.runs if (run.estimator, run.sequence, run.status) == (system, sequence, "ok")]
+        return [run for run in self._runs_of[system, sequence] if run.status == "ok"]
 
     @property
     def all_ok(self) -> bool:
